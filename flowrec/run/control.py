@@ -19,7 +19,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from flowrec.core import NS_PER_S, Action, OperatorEvent, UsageError
+from flowrec.core import NS_PER_S, Action, Coverage, OperatorEvent, UsageError
 
 Result = TypeVar("Result")
 
@@ -128,6 +128,12 @@ class RunControl:
     def skip_ramp(self) -> None:
         """Leave no time for a ramp."""
         self._since_s = min(self._since_s, self._clock() - RAMP_PATIENCE_S)
+
+    def with_stop(self, covered: Coverage) -> Coverage:
+        """The coverage, with the stop that ended it; itself if there was none."""
+        if not self.reason:
+            return covered
+        return replace(covered, stopped=self.reason.removeprefix("stopped by "), status=self.stop_status)
 
     # ---- for the loop
 

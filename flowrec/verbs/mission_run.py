@@ -279,7 +279,7 @@ class _Mission:
         if isinstance(rig, MovieRig):
             if rig.noticed:
                 facts["note_movie"] = "; ".join(rig.noticed)
-            self._covered = _coverage_of_movie(rig, self.run_control)
+            self._covered = self.run_control.with_stop(Coverage(rig.taken, rig.images, "images"))
             facts["covered"] = self._covered.amount
         doubted += [doubt for judge in self._judges for doubt in judge.doubts()]
         if doubts := doubts_text([*given_doubts, *doubted]):
@@ -320,12 +320,6 @@ def _judge_refinement(
         else:  # a movie without a log: nothing was asked that was not done
             facts["not_refined"] = f"because {refined.refused}"
     return facts, doubts
-
-
-def _coverage_of_movie(rig: MovieRig, control: RunControl) -> Coverage:
-    """Coverage of a movie: the images that were taken of all."""
-    stopped = control.reason.removeprefix("stopped by ")
-    return Coverage(rig.taken, rig.images, "images", stopped=stopped, status=control.stop_status)
 
 
 def _export_rrd(recorded: Recorded, control: RunControl, overwrite: bool) -> None:

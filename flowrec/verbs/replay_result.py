@@ -248,10 +248,4 @@ def coverage_of(
         part, left_out = f"from {from_s:g} s on", {f"{total - asked} ticks before {from_s:g} s": "not asked for"}
     elif ticks < asked and not control.reason:
         left_out = {f"{asked - ticks} ticks": "hold neither image nor track, so there is nothing to replay"}
-    covered = Coverage(ticks, asked, "ticks", part, left_out=left_out)
-    return with_stop(covered, control) if control.reason else covered
-
-
-def with_stop(covered: Coverage, control: RunControl) -> Coverage:
-    """The coverage, with the stop that ended it."""
-    return replace(covered, stopped=control.reason.removeprefix("stopped by "), status=control.stop_status)
+    return control.with_stop(Coverage(ticks, asked, "ticks", part, left_out=left_out))

@@ -60,7 +60,7 @@ from flowrec.store import (
 from flowrec.verbs.comparison import Comparison, Side
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.replay_change import Change
-from flowrec.verbs.replay_result import Replayed, WorkerCheck, WorkerResults, coverage_of, digest_lines, with_stop
+from flowrec.verbs.replay_result import Replayed, WorkerCheck, WorkerResults, coverage_of, digest_lines
 from flowrec.verbs.run_summary import figures_of, judges_of
 
 
@@ -243,8 +243,7 @@ class _Replay:
         control = self.control.run_control
         with self.control.end_on_signals():
             result.digest = control.unless_stopped(partial(digest_lines, self.session.path), None)
-        if control.reason:
-            result.covered = with_stop(result.covered, control)
+        result.covered = control.with_stop(result.covered)
 
 
 def _pipeline_of(session: Session, config: ResolvedConfig) -> Pipeline:
