@@ -25,6 +25,7 @@ from tests.short_missions import SMALL
 ROOT = Path(__file__).parents[1]
 STEPS = "plan.method=lab_kit_steps"
 PRESSURE = 'topics=["lab_kit_pressure"]'
+ONCE_MORE = pytest.mark.slow("a replay in a process that finds another state of the package")
 MISSION = [*SMALL, "mission.phases=plan,navigate", STEPS, "plan.lab_kit_steps.neighbours=8", PRESSURE]
 ONE_BY_ONE = """
 import contextlib, io, json, sys
@@ -112,6 +113,7 @@ def changed(site: Path, folder: Path, *, version: str = "1.0", code: tuple[str, 
     return copy
 
 
+@pytest.mark.slow("three verbs in a process that finds the package")
 def test_a_session_by_the_planner_of_a_package_is_verified_exported_and_read_by_its_verb(
     site: Path, flown: Path, tmp_path: Path
 ) -> None:
@@ -222,8 +224,16 @@ def test_without_the_package_its_session_is_read_and_a_replay_says_what_to_insta
     [
         ("1.1", ("", ""), 0, "recorded with lab_kit 1.0, replayed with lab_kit 1.1"),
         ("1.0", ("-> bool", "->  bool"), 0, "recorded with other code of lab_kit 1.0: sha256 "),
-        ("1.1", ("    neighbours:", "    nodes:"), 2, "are not those of lab_kit 1.1 (plan.lab_kit_steps: unknown key"),
-        ("1.0", ("import json", "import no_such_module"), 2, "No module named 'no_such_module'); mend or uninstall it"),
+        pytest.param(
+            *("1.1", ("    neighbours:", "    nodes:"), 2),
+            "are not those of lab_kit 1.1 (plan.lab_kit_steps: unknown key",
+            marks=ONCE_MORE,
+        ),
+        pytest.param(
+            *("1.0", ("import json", "import no_such_module"), 2),
+            "No module named 'no_such_module'); mend or uninstall it",
+            marks=ONCE_MORE,
+        ),
     ],
 )
 def test_a_replay_by_another_state_of_the_package_says_so(

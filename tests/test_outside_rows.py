@@ -239,6 +239,7 @@ def test_a_name_of_ours_can_not_be_taken(entries: dict[str, dict[str, str]]) -> 
         load_config(None, ["plan.method=swift"])
 
 
+@pytest.mark.slow("flies a mission and replays it")
 def test_a_mission_whose_stages_are_all_of_packages_arrives_and_replays_exactly(
     entries: dict[str, dict[str, str]], tmp_path: Path
 ) -> None:
@@ -275,6 +276,7 @@ def test_a_rig_of_a_package_is_in_real_time_if_it_says_so_and_its_recording_repl
     assert replay_session(recorded.path, verify=True).same
 
 
+@pytest.mark.slow("starts a guardian for an amplifier of a package")
 def test_an_amplifier_of_a_package_is_opened_and_its_guardian_takes_the_output_to_zero(
     entries: dict[str, dict[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

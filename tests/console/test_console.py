@@ -420,6 +420,7 @@ def test_a_console_that_is_killed_or_stopped_does_not_slow_the_run_which_says_so
     until(lambda: not psutil.pid_exists(pid))
 
 
+@pytest.mark.slow("serves Rerun's viewer from a process of its own")
 def test_reruns_viewer_and_its_stream_are_behind_the_same_door_and_can_only_be_read(scene: Scene, ticks: Ticks) -> None:
     with LiveView(scene, "serve") as live, (served := Served(scene, live.port)).console:
         live.write(next(ticks(1)))

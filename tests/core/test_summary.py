@@ -81,6 +81,7 @@ def test_record_gives_its_results_as_numbers_and_info_who_made_it(tmp_path: Path
     assert all(text in shown for text in ("Ada", "chip 7", "first light", "42", facts["flowrec"]))
 
 
+@pytest.mark.slow("refines a mission again")
 def test_a_replay_gives_numbers_before_and_after(told, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "again.mcap"
     found = json.loads(told("replay", GOLDEN, "--plan", "astar_time", "--out", out, "--json"))

@@ -29,6 +29,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {kind: flowrec.export(GOLDEN, folder / name, file_format=kind) for kind, name in names.items()}
 
 
+@pytest.mark.slow("exports and reads a whole session")
 def test_a_tiff_has_the_same_images_and_stamps_and_states_its_scale_as_ome(exported):
     frames = list(flowrec.open(GOLDEN).frames)
     with open_movie(exported["tiff"]) as movie:

@@ -136,6 +136,7 @@ def test_out_of_sight_the_robot_is_held_then_the_field_goes_off_and_an_alarm_nam
     assert done.report.outcome == "lost" and cause in done.report.note and "mission: lost" in lost[2]
 
 
+@pytest.mark.slow("flies a mission with a fault and replays it four times")
 def test_in_sight_again_the_robot_goes_on_and_the_session_replays_from_every_part_of_the_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,6 +151,7 @@ def test_in_sight_again_the_robot_goes_on_and_the_session_replays_from_every_par
         assert replayed.comparison.identical, str(replayed.comparison.first)
 
 
+@pytest.mark.slow("flies two missions")
 def test_a_repeated_image_is_no_measurement_of_the_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flown(monkeypatch, tmp_path / "s.mcap", frozen, until_s=AT_S + 0.4)
     ticks = [tick for tick in SessionReader(tmp_path / "s.mcap").ticks(with_frames=False) if tick.estimate is not None]

@@ -62,6 +62,7 @@ def said(ticks: list[Tick]) -> list[tuple[str, str]]:
     return [(event.action, event.text) for k, event in enumerate(events) if k == 0 or event is not events[k - 1]]
 
 
+@pytest.mark.slow("flies a mission with an operator and replays it")
 def test_a_held_robot_stays_goes_on_and_arrives_and_a_replay_is_identical(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,6 +130,7 @@ def test_zero_takes_the_field_away_on_that_very_tick_and_a_replay_agrees(
     assert done.comparison.identical, str(done.comparison.first)
 
 
+@pytest.mark.slow("flies a mission in a flow that is faster than the robot")
 def test_a_robot_that_the_flow_carries_off_its_place_is_told_of_and_does_its_best(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -135,6 +135,7 @@ def test_a_new_goal_does_not_make_the_reference_jump(steered: tuple[Path, list[T
             assert math.dist(now.demand.reference_um, last.demand.reference_um) < 60.0
 
 
+@pytest.mark.slow("replays a mission in more than fifteen segments")
 def test_it_replays_identically_from_every_tick_at_which_something_was_set_ordered_or_adopted(
     steered: tuple[Path, list[Tick]],
 ) -> None:

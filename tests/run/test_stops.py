@@ -127,6 +127,7 @@ def test_no_signal_is_lost_where_their_handling_begins_and_ends() -> None:
     assert raised > 10
 
 
+@PROCESS
 def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run(tmp_path: Path) -> None:
     done = ended("SIGTERM twice", tmp_path, PATIENT)
     told = done.after_cause()
@@ -140,6 +141,7 @@ def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run
     assert any(action == "zero" and "SIGTERM again" in text for action, text in actions), actions
 
 
+@PROCESS
 def test_ctrl_z_stops_the_process_with_the_field_off_and_fg_ends_the_run(tmp_path: Path) -> None:
     done = ended("SIGTSTP", tmp_path, PATIENT)
     stopped = (tmp_path / "driver.log.stopped").read_text().split("\n")
@@ -184,9 +186,8 @@ def test_a_loop_that_hangs_loses_its_field_while_it_hangs_and_the_replay_is_exac
     assert events(done) == [("zero", "guard: no tick for 0.5 s")]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("camera stuck in C", marks=PROCESS), "camera stuck in C, SIGINT three times, SIGTERM"]
-)
+@PROCESS
+@pytest.mark.parametrize("name", ["camera stuck in C", "camera stuck in C, SIGINT three times, SIGTERM"])
 def test_a_camera_that_hangs_in_c_loses_the_field_and_the_process_ends_by_itself(name: str, tmp_path: Path) -> None:
     done = ended(name, tmp_path)
     assert [event for event, _ in done.after_cause()[-3:]] != ["returns"]  # the main thread has never come back
@@ -203,6 +204,7 @@ def test_a_stage_that_raises_ends_the_run_after_the_field(tmp_path: Path) -> Non
     assert SessionReader(done.path).outcome["reason"] == "ValueError: a stage that fails"
 
 
+@PROCESS
 def test_a_worker_that_is_killed_ends_the_run_after_the_field(tmp_path: Path) -> None:
     """That one is stopped is told in the same way: tests/run/test_worker_process.py."""
     done = ended("worker killed", tmp_path, PATIENT)

@@ -104,6 +104,7 @@ def command(tmp_path: Path) -> Iterator[Command]:
                 os.close(descriptor)
 
 
+@pytest.mark.slow("a process that records in real time in a terminal")
 def test_keys_are_recorded_and_the_terminal_is_given_back_to_the_shell_at_the_end(command: Command) -> None:
     assert b"keys: q stop" in command.said
     command.until(lambda: command.raw)
@@ -123,6 +124,7 @@ def test_keys_are_recorded_and_the_terminal_is_given_back_to_the_shell_at_the_en
     assert events[1].text == "looks good"
 
 
+@pytest.mark.slow("a process that records in real time in a terminal")
 def test_ctrl_z_gives_the_terminal_back_to_the_shell_and_ends_the_run(command: Command) -> None:
     command.until(lambda: command.raw)
     command.press("\x1a")
@@ -135,6 +137,7 @@ def test_ctrl_z_gives_the_terminal_back_to_the_shell_and_ends_the_run(command: C
     assert termios.tcgetattr(command.keys) == command.before
 
 
+@pytest.mark.slow("a process that records in real time in a terminal")
 def test_a_frozen_terminal_neither_stops_the_run_nor_its_end(command: Command) -> None:
     command.frozen = True
     command.press("\x13")  # Ctrl-S: whatever is printed from now on waits for ever

@@ -138,6 +138,7 @@ def test_a_process_that_is_stopped_while_the_mission_waits_for_it_is_told_of(ord
     assert "was stopped by a signal" in str(answer(process))
 
 
+@pytest.mark.slow("starts processes of the worker")
 def test_whatever_an_order_raises_or_answers_comes_back(order, working) -> None:
     process = working("raises", "takes two", "holds a lock", "exits", "gives what can not be read")
     errors = []
@@ -151,6 +152,7 @@ def test_whatever_an_order_raises_or_answers_comes_back(order, working) -> None:
         assert told in str(error)
 
 
+@pytest.mark.slow("starts four processes of the worker")
 def test_what_the_process_printed_is_in_the_log_that_the_error_names_and_a_clean_end_leaves_none(
     order, working, tmp_path: Path
 ) -> None:
@@ -168,6 +170,7 @@ def test_what_the_process_printed_is_in_the_log_that_the_error_names_and_a_clean
     assert not list(tmp_path.glob("*.log"))
 
 
+@pytest.mark.slow("starts a process of the worker, for where it is started")
 def test_a_file_in_the_working_directory_does_not_shadow_a_library(
     order, working, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,6 +64,7 @@ def is_the_run(far: Session, near: Session) -> None:
     assert far.notes == near.notes and far.notes[0].tags == ("bubble",)
 
 
+@pytest.mark.slow("reads a run of several parts through a server")
 def test_a_run_in_parts_in_a_bucket_is_the_run(bucket: S3Server, run: Path) -> None:
     is_the_run(Session(f"s3://{BUCKET}/runs/x.mcap"), Session(run))
     assert sum("list-type" in url for _, url in bucket.requests) < 12

@@ -182,6 +182,7 @@ def test_the_limits_on_hostile_files_hold_at_a_url(
             flowrec.open(server.url)
 
 
+@pytest.mark.slow("makes every output of a session through a server")
 def test_outputs_of_a_session_at_a_url_are_made_in_this_folder(
     server: RangeServer, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

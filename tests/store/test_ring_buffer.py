@@ -219,6 +219,7 @@ for number, tick in enumerate(with_events((200, ("mark", "")))):
 """
 
 
+@pytest.mark.slow("kills a recording in a process of its own")
 def test_a_snapshot_that_is_being_taken_outlives_a_kill(tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", KILLED, tmp_path / "x.mcap"], stdout=subprocess.PIPE, text=True

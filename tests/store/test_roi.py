@@ -75,6 +75,7 @@ def test_where_an_image_is_lit_is_found():
     assert nonzero_window(image) == (0, 0, 60, 40)
 
 
+@pytest.mark.slow("flies a mission and replays it from several times")
 def test_a_mission_in_windows_replays_exactly_from_anywhere_and_says_what_it_is(session, tmp_path, capsys):
     sets = [*SMALL, "recording.region=robot", "recording.full_every_s=3", "duration_s=4"]
     path = record(load_config(None, sets), tmp_path / "s.mcap").path

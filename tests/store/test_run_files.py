@@ -279,6 +279,7 @@ def test_a_part_that_repeats_something_else_is_odd(run):
     ]
 
 
+@pytest.mark.slow("replays a run and each of its parts")
 def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut(session, tmp_path):
     with SessionReader(session) as reader:
         ticks, header = list(reader.ticks()), reader.header

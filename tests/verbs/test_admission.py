@@ -41,6 +41,7 @@ def tried(prepared: Prepared, folder: Path, rig: SimulatedRig, *, accept: bool =
     return admit(rig, worker, (config, prepared.chip, prepared.pipeline), {}, folder, RunControl())
 
 
+@pytest.mark.slow("rehearses a recording of large images")
 def test_images_that_the_machine_does_not_hold_are_refused_before_there_is_a_file(tmp_path: Path) -> None:
     config = load_config(None, [*SMALL, "recording.admission_s=0.01", f"camera.rate_hz={HZ:g}", "duration_s=0.02"])
     with pytest.raises(RigError, match=rf"holds \d+ of {HZ:g} images a second.*close other programs.*--accept-losses"):

@@ -57,6 +57,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow("tracks and aligns a whole movie")
 def test_a_log_that_is_100_ms_late_is_found_though_the_robot_is_not_always_seen(imported: Path) -> None:
     session = flowrec.open(imported)
     found = json.loads(session.provenance["alignment"])

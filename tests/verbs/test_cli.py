@@ -102,6 +102,7 @@ def test_files_that_are_no_session_are_told_apart(session: Path, tmp_path: Path)
     one_line_error(flowrec("record", "--out", tmp_path / "no" / "such" / "a.mcap"), 2, "no such directory")
 
 
+@pytest.mark.slow("a process that records in real time")
 def test_sigterm_zeroes_the_coils_and_finishes_the_file(tmp_path: Path) -> None:
     out = tmp_path / "stopped.mcap"
     words = [word for setting in LONG for word in ("--set", setting)]

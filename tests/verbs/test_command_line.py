@@ -189,6 +189,7 @@ def test_planners_that_are_not_installed_are_left_out_and_named(
     assert "rrt, rrt_star, which need OMPL 2" in capsys.readouterr().err
 
 
+@pytest.mark.slow("replays a mission and fits a network")
 def test_a_refinement_that_changes_nothing_says_why(
     session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -206,6 +207,7 @@ def test_a_bar_that_stands_names_no_time_left() -> None:
     assert terminal.time_left(None, stands_s=0.0) == ""
 
 
+@pytest.mark.slow("replays a session four times")
 def test_a_replay_states_the_path_of_its_session(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -221,6 +221,7 @@ def test_a_comparison_that_is_stopped_says_what_it_compared(tmp_path: Path, tick
     assert found.as_json()["covered"]["whole"] is False
 
 
+@pytest.mark.slow("replays a mission")
 def test_a_replay_differs_from_its_recording_by_nature_only_and_this_is_said(session: Path, tmp_path: Path) -> None:
     assert run("replay", session, "--out", tmp_path / "again.mcap", "--json")[0] == 0
     status, said = run("compare", session, tmp_path / "again.mcap", "--json")

@@ -58,6 +58,7 @@ def first_place_px(session: Path) -> np.ndarray:
     return np.asarray(flowrec.open(session).calibration.to_px(track.position_um))
 
 
+@pytest.mark.slow("imports a movie four times")
 def test_two_bodies_alike_are_refused_with_a_picture_and_each_way_to_name_one_takes_it(
     known: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,6 +94,7 @@ def test_a_body_that_is_alone_needs_no_one_to_name_it(known: Config, tmp_path: P
     assert flowrec.open(tmp_path / "a.mcap").config.tracker.click_px is None
 
 
+@pytest.mark.slow("imports two movies and replays one")
 def test_a_shaking_movie_gives_the_track_of_a_still_one_and_replays_exactly(known: Config, tmp_path: Path) -> None:
     for name, shake_px in (("still", 0.0), ("shaken", 2.0)):
         (tmp_path / name).mkdir()

@@ -134,6 +134,7 @@ def test_the_head_of_the_session_says_what_it_was_made_of(lab: Laboratory, impor
     assert flowrec.info(imported)["times_file"] == "frames.csv" and "seed" not in facts
 
 
+@pytest.mark.slow("replays a whole movie three times")
 def test_a_session_that_was_imported_replays_with_other_settings(lab: Laboratory, imported: Path) -> None:
     out = lab.folder / "again.mcap"
     flowrec.replay(imported, flowrec.Change(observer="luenberger", sets=("robot.um_per_rev=20",)), out=out)
@@ -170,6 +171,7 @@ def test_without_a_log_the_movie_is_still_a_session_that_says_what_it_does_not_k
     assert flowrec.open(tmp_path / "replayed.mcap").fields["refined"].refused
 
 
+@pytest.mark.slow("imports a whole movie")
 def test_a_body_that_only_drifts_shows_the_flow_without_a_log(
     lab: Laboratory, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,6 +186,7 @@ def test_a_body_that_only_drifts_shows_the_flow_without_a_log(
         flowrec.import_movie(lab.folder / "short.avi", out, drifting, coils=lab.log, overwrite=True)
 
 
+@pytest.mark.slow("imports a whole movie twice")
 def test_a_robot_acts_on_the_log_its_delay_later(lab: Laboratory) -> None:
     rows = [HEADER, (0, 0, 0, 4), (1.0, 12, 90, 4), (1.5, 0, 90, 4)]
     log = lab.table("step.csv", rows)
@@ -198,6 +201,7 @@ def test_a_robot_acts_on_the_log_its_delay_later(lab: Laboratory) -> None:
     assert 0.0 <= first - 1.0 - delay_s < frame_s + 1e-6 and -frame_s - 1e-6 < last - 1.5 - delay_s < 0.0
 
 
+@pytest.mark.slow("imports a movie for each setting")
 def test_clock_and_heading_of_the_log_are_set_by_four_settings(lab: Laboratory) -> None:
     """A log with another zero and rate, and a mirrored heading, gives the turns of the right one."""
     rate, offset = 1.2, 7.25  # the movie says 1 s where 1.2 s of the log pass
@@ -286,6 +290,7 @@ def test_bad_input_is_one_line_and_leaves_what_was_there(kind: str, lab: Laborat
     assert (tmp_path / "a.mcap").read_bytes() == b"what was there"
 
 
+@pytest.mark.slow("imports a whole movie twice")
 def test_a_movie_that_breaks_off_is_taken_as_far_as_it_goes_if_that_is_said(
     lab: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -46,6 +46,7 @@ def test_a_new_session_states_its_numerics_and_the_first_release_is_version_1(se
     assert flowrec.open(GOLDEN).numerics == "1"
 
 
+@pytest.mark.slow("verifies a session by other numerics several times")
 @pytest.mark.usefixtures("other_numerics")
 def test_a_verification_by_other_numerics_says_so_instead_of_different(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -121,9 +121,8 @@ def flowrec_process(*words: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-@pytest.mark.parametrize(
-    "end", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow("as a kill, in processes of its own"))]
-)
+@pytest.mark.slow("kills an upload in a process of its own")
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
 def test_a_push_that_is_killed_or_interrupted_goes_on_where_it_was(
     server: S3Server, large: Path, end: signal.Signals
 ) -> None:

@@ -100,7 +100,7 @@ def with_declared_settings(pipeline: Pipeline, order: Tick) -> object:
 
 @pytest.mark.parametrize(
     "where",
-    ["the start", pytest.param("an order under way", marks=SLOW), pytest.param("the survey", marks=SLOW), "the end"],
+    [*(pytest.param(each, marks=SLOW) for each in ("the start", "an order under way", "the survey")), "the end"],
 )
 def test_a_recording_in_real_time_verifies_from_any_time_by_the_declared_settings_alone(
     realtime_session: Path, where: str, monkeypatch: pytest.MonkeyPatch
@@ -123,6 +123,7 @@ def test_a_recording_in_real_time_verifies_from_any_time_by_the_declared_setting
     assert len(done.worker.lines) == made >= 1, lines
 
 
+@pytest.mark.slow("computes a survey by information again")
 def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
     realtime_session: Path, tmp_path: Path, computed: list[str]
 ) -> None:
@@ -135,6 +136,7 @@ def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
     assert len(computed) > 2
 
 
+@pytest.mark.slow("replays two missions with other settings")
 def test_a_replay_computes_nothing_whose_settings_and_inputs_are_those_of_the_recording(
     realtime_session: Path, session: Path, computed: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,6 +196,7 @@ def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp
     assert written.tick_before(written.last_ns).refined.same_as(done.replayed.refined)  # type: ignore[union-attr]
 
 
+@pytest.mark.slow("refines a session twice")
 def test_a_replay_can_refine_with_what_the_smoother_sees_in_hindsight(session: Path) -> None:
     smoothed = Change(refine="assimilate", sets=("sampler.method=smoothed",))
     done = verb.replay_session(session, smoothed)
@@ -230,6 +233,7 @@ def test_another_observer_changes_estimates_and_leaves_tracks(session: Path, com
     assert done.comparison.topics["/robot/estimate"].different > 0
 
 
+@pytest.mark.slow("flies a survey, refines and plans")
 def test_a_survey_alone_can_be_refined_and_planned_afterwards(tmp_path: Path) -> None:
     sets = [*SMALL, "mission.phases=survey"]
     survey = record(load_config(None, sets), tmp_path / "survey.mcap")
@@ -265,6 +269,7 @@ def test_an_existing_output_is_not_overwritten(session: Path) -> None:
         verb.replay_session(session, Change(), out=session)
 
 
+@pytest.mark.slow("verifies a session in segments, alone and in two processes")
 def test_a_verification_in_segments_finds_what_one_pass_finds(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay_segments, "_TICKS", 40)
     alone = replay_segments.verify(session)
@@ -275,6 +280,7 @@ def test_a_verification_in_segments_finds_what_one_pass_finds(session: Path, mon
     assert beside.as_json() == alone.as_json()
 
 
+@pytest.mark.slow("refines a mission again")
 def test_a_scale_that_the_refined_map_contradicts_is_a_doubt_of_the_replay(
     session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

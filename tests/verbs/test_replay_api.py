@@ -47,7 +47,8 @@ def payloads(path: Path) -> dict[str, list[tuple[int, bytes]]]:
     return found
 
 
-@pytest.mark.parametrize("notebook", [False, pytest.param(True, marks=pytest.mark.slow("starts a kernel"))])
+@pytest.mark.slow("replays a session four times")
+@pytest.mark.parametrize("notebook", [False, True])
 def test_replays_in_threads_and_in_a_notebook_make_the_bytes_that_the_verb_makes(
     notebook: bool, tmp_path: Path
 ) -> None:

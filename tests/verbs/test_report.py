@@ -128,6 +128,7 @@ def test_an_older_session_without_clocks_says_so_in_words() -> None:
     assert "Time per tick" in caption and "The session holds no clock of a camera." in caption
 
 
+@pytest.mark.slow("draws a report three times")
 def test_the_same_session_gives_the_same_bytes_twice_and_outputs_are_not_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

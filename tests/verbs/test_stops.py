@@ -172,6 +172,7 @@ def test_a_signal_during_imports_is_one_line(verb: str, module: str, name: str, 
     assert done.stdout == ""
 
 
+@pytest.mark.slow("stops two verbs in processes of their own")
 def test_a_check_and_an_export_that_are_stopped_say_after_how_much(tmp_path: Path) -> None:
     done = stopped(["check", MODERATE, "--json"], AT_PROGRESS.format(count=8, name="SIGINT"))
     found = json.loads(done.stdout)

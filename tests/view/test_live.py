@@ -67,7 +67,9 @@ def returns(call: Callable[[], object]) -> bool:
     return not thread.is_alive()
 
 
-@pytest.mark.parametrize("blow", [signal.SIGSTOP, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "blow", [signal.SIGSTOP, pytest.param(signal.SIGKILL, marks=pytest.mark.slow("a run beside a viewer, once more"))]
+)
 def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
     scene: Scene, ticks: list[Tick], blow: signal.Signals
 ) -> None:
@@ -83,6 +85,7 @@ def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
     assert returns(lambda: live.close(0.5))
 
 
+@pytest.mark.slow("a run and a server of Rerun in processes of their own")
 def test_a_live_view_listens_on_this_machine_only_and_ends_with_the_run(scene: Scene, ticks: list[Tick]) -> None:
     with LiveView(scene, "spawn") as live:
         pid = live.pid
@@ -162,6 +165,7 @@ def test_a_port_that_is_taken_is_said(scene: Scene, ticks: list[Tick]) -> None:
             live.write(ticks[0])
 
 
+@pytest.mark.slow("a run and a server of Rerun in processes of their own")
 def test_a_window_keeps_its_server_after_the_run(
     scene: Scene, ticks: list[Tick], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

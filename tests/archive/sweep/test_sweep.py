@@ -299,6 +299,7 @@ def test_workers_that_are_killed_before_they_are_ready_are_started_again_but_not
         cluster._local_cluster(2)
 
 
+@pytest.mark.slow("replays a session in a process of its own and beside it")
 def test_a_row_is_what_flowrec_replay_and_check_say(session: Path) -> None:
     content = content_of(flowrec.open(session))
     task = Task(str(session), content, (("refine", "gain"), ("robot.um_per_rev", "24")), judge=True)

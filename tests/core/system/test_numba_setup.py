@@ -59,6 +59,7 @@ def package(tmp_path: Path) -> Path:
 TWICE = "from flowrec.outer import twice; print(twice(), sum(twice.stats.cache_hits.values()))"
 
 
+@pytest.mark.slow("compiles kernels in processes of its own")
 def test_a_kernel_is_compiled_once_and_anew_after_a_change_of_another_file_that_it_calls(
     package: Path, tmp_path: Path
 ) -> None:

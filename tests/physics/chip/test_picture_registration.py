@@ -85,6 +85,7 @@ def searched(monkeypatch):
     return finds
 
 
+@pytest.mark.slow("searches two pictures for every angle")
 def test_walls_that_grey_levels_and_local_contrast_put_in_different_places_are_refused(searched):
     """Broad lines, bright on one side of the channels: grey levels alone agree best 117 um beside the truth."""
     truth, _ = seen("relief", 37.0, shift_um=(300.0, -200.0))
@@ -99,6 +100,7 @@ def test_walls_that_grey_levels_and_local_contrast_put_in_different_places_are_r
         register(image, VESSELS, ABOUT, (False,))
 
 
+@pytest.mark.slow("registers a picture several times")
 def test_the_residual_is_how_far_the_walls_are_from_the_mask():
     truth, image = seen("dark lines", 0.0)
     assert 0.0 < fitted(image, truth).residual_um < 2.0

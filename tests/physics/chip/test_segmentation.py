@@ -20,7 +20,14 @@ def seen(look):
     return picture(VESSELS.mask, 20.0, camera, SIZE_PX, LOOKS[look], np.random.default_rng(4))
 
 
-@pytest.mark.parametrize(("look", "shown"), [("dark lines", "dark"), ("thin bright lines", "bright"), ("ink", "step")])
+@pytest.mark.parametrize(
+    ("look", "shown"),
+    [
+        ("dark lines", "dark"),
+        ("ink", "step"),
+        pytest.param("thin bright lines", "bright", marks=pytest.mark.slow("segments a picture of another look")),
+    ],
+)
 def test_channel_and_openings_are_found_whether_walls_or_fluid_show(look, shown):
     found = segment(seen(look))
     mask, um_per_px = chip_mask(found, 20.0)

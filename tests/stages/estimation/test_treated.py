@@ -79,6 +79,7 @@ def swim(seed, seconds=60.0, noise_um=4.0, q=2000.0):
     return np.array(flows), tracks, inputs
 
 
+@pytest.mark.slow("many flights of the observer")
 def test_the_smoother_is_better_than_the_filter_and_honest_about_it():
     kalman = Kalman(position_noise_um=4.0, flow_noise_um2_s3=2000.0, drift_um2_s=0.0)
     pulls, gains = [], []

@@ -31,7 +31,7 @@ def test_in_a_uniform_flow_the_plan_takes_zermelos_time(flow):
     assert (np.diff(route.arrival_s) > 0).all()
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("sign", [1.0, pytest.param(-1.0, marks=pytest.mark.slow("the same shear, mirrored"))])
 def test_in_a_linear_shear_the_plan_is_within_one_percent_of_the_shooting_solution(sign):
     # v = (s y, 0): along the fastest way the heading turns as phi' = -s cos^2 phi (Zermelo's navigation formula).
     mask, rate, speed = open_water(120, 160), 0.4 * sign, 100.0

@@ -48,6 +48,7 @@ def assumed(chip):
     return SOLVER.solve(chip)
 
 
+@pytest.mark.slow("refines with every doubt about the chip")
 def test_a_branch_that_is_half_blocked_is_found_and_the_map_is_right_beside_it(chip, assumed):
     truth = SOLVER.solve(blocked(chip))
     observations = observed(truth, chip)

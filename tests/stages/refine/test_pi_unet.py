@@ -75,6 +75,7 @@ def test_a_closed_branch_is_found_by_the_assimilation_and_pi_unet_does_not_make_
     assert np.mean(np.abs(score) < 2.0) > 0.9
 
 
+@pytest.mark.slow("fits a network")
 def test_a_robot_that_slips_is_not_taken_for_an_error_of_the_field(twin):
     case = twin(noise=0.02)
     points = case.observations.position_um
@@ -102,6 +103,7 @@ def test_the_printed_variants_run_and_give_the_same_bytes_twice(twin, settings):
     assert case.error(first) < case.error(case.assumed)
 
 
+@pytest.mark.slow("fits a network three times")
 def test_the_finish_gives_the_same_bytes_twice_and_bears_outliers(twin):
     case = twin()
     flow = case.observations.flow_um_s.copy()

@@ -81,6 +81,7 @@ def test_a_change_of_the_viscosity_alone_leaves_the_pressures_as_they_are(driven
     np.testing.assert_allclose(drawn.boundary_values, driven.boundary_values, rtol=2.0 * (0.30 * 0.01) ** 2)
 
 
+@pytest.mark.slow("refines with two laws of viscosity")
 def test_the_law_of_viscosity_is_found_where_the_flow_tells_it_and_left_open_where_not():
     def exponent(depth_um, least_px, length=64):
         mask = np.zeros((28, length), bool)

@@ -145,7 +145,7 @@ def test_noise_beyond_what_is_stated_is_said_with_its_factor_and_a_pump_is_no_no
     assert float(factor) == pytest.approx(4.0, rel=0.2)
 
 
-@pytest.mark.parametrize("depth_um", [50.0, 100.0])
+@pytest.mark.parametrize("depth_um", [50.0, pytest.param(100.0, marks=pytest.mark.slow("refines for another depth"))])
 def test_the_depth_of_a_chip_that_states_none_is_said_where_it_matters(depth_um):
     settings = Assimilate(doubt_walls=False)
     (sentence,) = refined(true=chip(TRUE, depth_um=depth_um), settings=settings, count=80)[1]

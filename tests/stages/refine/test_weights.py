@@ -47,6 +47,7 @@ def test_weights_that_do_not_fit_are_one_clear_line(kind, tmp_path, monkeypatch,
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.slow("fits a network from two starts")
 def test_the_shipped_weights_beat_a_cold_start_and_the_finish_beats_both(twin):
     case = twin()
 

@@ -108,6 +108,7 @@ def test_the_track_on_a_shaking_stage_is_that_of_the_chip() -> None:
     assert max(off) < 0.35
 
 
+@pytest.mark.slow("flies a mission on a shaking stage")
 def test_a_simulated_mission_on_a_shaking_stage_has_the_track_of_one_that_rests(tmp_path: Path) -> None:
     shakes = [*SMALL, "simulated.shake_um=40", "simulated.shake_hz=2", "mission.phases=['survey']", "duration_s=2"]
     sway_px = {}
