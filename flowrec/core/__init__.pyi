@@ -31,7 +31,6 @@ from .errors import (
     NotFiniteError as NotFiniteError, RigError as RigError, SessionError as SessionError,
     UnreachableError as UnreachableError, UsageError as UsageError, printable as printable,
 )
-from .field_views import VALUES as VALUES, values_of as values_of
 from .interpolation import (
     bilinear as bilinear, bilinear_known as bilinear_known, cell_at as cell_at, cells_at as cells_at,
     corner_weights as corner_weights, nearest_pixel as nearest_pixel, nearest_pixels as nearest_pixels,
@@ -43,6 +42,7 @@ from .messages import (
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )
+from .messages.slow_stages import VALUES as VALUES, values_of as values_of
 from .methods import (
     ListedMethod as ListedMethod, Method as Method, Methods as Methods, OWN as OWN, REPLAYED as REPLAYED,
     table_at as table_at,
@@ -89,6 +89,7 @@ from .system.processes import (
     Priority as Priority, child_command as child_command, child_environment as child_environment,
     forget_peak as forget_peak, peak_mb as peak_mb, pool as pool, prioritise_process as prioritise_process,
     prioritise_thread as prioritise_thread, realtime_priority as realtime_priority,
+    start_child as start_child,
 )
 from .system.regular_file import refuse_irregular as refuse_irregular
 from .system.stderr import said_within as said_within

@@ -59,6 +59,7 @@ Vector2 = Annotated[Vector, Shape(2)]
 COILS = "coils"  # a length that is the number of coils of the run
 PerCoil = Annotated[Vector, Shape(COILS)]
 NanFloat = Annotated[float, Shape(finite=False)]  # a number for which NaN or infinity has a meaning
+NOT_STATED: Any = ()  # default of a vector, which the message makes (0,)
 
 
 @dataclass(frozen=True, slots=True)

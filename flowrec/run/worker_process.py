@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, BinaryIO
 
-from flowrec.core import WORKER_FIELDS, FlowrecError, Tick, child_command, child_environment
+from flowrec.core import WORKER_FIELDS, FlowrecError, Tick, start_child
 from flowrec.run.workers import Result, Results, order_of, work
 from flowrec.stages import Pipeline, warm_up
 
@@ -45,14 +45,7 @@ class ProcessWorker:
         self._printed = b""
         self._orders.put(pipeline)
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - our own module
-                child_command("flowrec.run.worker_process"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,  # Ctrl-C and a closed terminal end the run, and then the run ends this
-                env=child_environment(),
-            )
+            self._process = start_child("flowrec.run.worker_process", stderr=subprocess.PIPE)
         except OSError as error:
             raise FlowrecError(
                 f"{_NAME} does not start ({error.strerror or error}); free memory, then record again"

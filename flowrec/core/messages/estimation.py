@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.declarations import Matrix, Message, NanFloat, Shape, Vector, Vector2
+from flowrec.core.declarations import NOT_STATED, Matrix, Message, NanFloat, Shape, Vector, Vector2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,16 +30,16 @@ class Estimate(Message):
         Vector,
         Shape("n"),
         "(3,) gradient of the flow at the robot: dvx/dx, dvx/dy, dvy/dx; dvy/dy = -dvx/dx. (0,): not known",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     surprise: Annotated[
         Vector, Shape("m"), "(2,) sliding mean of the innovations, in standard deviations; (0,): not known"
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     um_per_rev: Annotated[float | None, "of the robot; None: the nominal one is used"] = None
     rolled_um_s: Annotated[
         Vector,
         Shape("o"),
         "(2,) the robot's own motion through the fluid, averaged over time as `flow_um_s` is; (0,): not known",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +65,7 @@ class Health(Message):
         "Motion per revolution, see estimation/step_out.py. (4,) exponential sums: um rolled along the heading, um "
         "expected from the revolutions, um by which the map's flow carried the robot, s. (0,): none yet, or not "
         "recorded.",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     limit_hz: Annotated[float | None, "limit of the field's frequency because of step-out; None: the robot's own"] = (
         None
     )
@@ -75,7 +75,7 @@ class Health(Message):
         Shape("o"),
         "(2,) um/s rolled and um/s expected from the revolutions, just before the limit was lowered; (0,): no limit to "
         "test",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

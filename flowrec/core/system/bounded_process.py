@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from flowrec.core.errors import FlowrecError, UsageError
-from flowrec.core.system.processes import child_command, child_environment
+from flowrec.core.system.processes import start_child
 
 Answer = TypeVar("Answer")
 
@@ -97,14 +97,8 @@ class BoundedProcess:
 
     def _start_child(self) -> subprocess.Popen[bytes]:
         try:
-            return subprocess.Popen(  # noqa: S603 - our own module
-                child_command("flowrec.core.system.bounded_process"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._printed,
-                start_new_session=True,  # Ctrl-C ends the caller, and then the caller ends this
-                env=child_environment() | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            )
+            one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+            return start_child("flowrec.core.system.bounded_process", environment=one_thread, stderr=self._printed)
         except OSError as error:
             raise self._error(f"{self._where}: no process starts to read it ({error.strerror or error})") from error
 

@@ -204,18 +204,14 @@ class CoilProbe:
     info : of the amplifier.
     amplitude_mt, rotation_hz : the field that the limits permit.
     trip_s : time from a request to the guardian until the amplifier has confirmed that it is at zero.
-    silence_s : of the guardian.
     warnings : one line each.
-    only_hardware : what no program can do.
     """
 
     info: AmplifierInfo
     amplitude_mt: float
     rotation_hz: float
     trip_s: float
-    silence_s: float
     warnings: tuple[str, ...]
-    only_hardware: str = ONLY_HARDWARE
 
 
 def probe_amplifier(config: ResolvedConfig) -> CoilProbe:
@@ -243,4 +239,4 @@ def probe_amplifier(config: ResolvedConfig) -> CoilProbe:
         warnings.append(
             f"the coils make {limits.amplitude_mt:.3g} of coils.amplitude_mt = {config.coils.amplitude_mt:g}"
         )
-    return CoilProbe(info, limits.amplitude_mt, limits.rotation_hz, trip_s, config.lab.guardian_s, tuple(warnings))
+    return CoilProbe(info, limits.amplitude_mt, limits.rotation_hz, trip_s, tuple(warnings))

@@ -35,7 +35,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Self
 
-from flowrec.core import Priority, RigError, child_command, child_environment, prioritise_process
+from flowrec.core import Priority, RigError, prioritise_process, start_child
 
 SILENCE_S = 0.1
 ONLY_HARDWARE = (
@@ -89,14 +89,13 @@ class Guardian:
         self._status, write_status = os.pipe()
         command = [f"{self.silence_s:g}", str(read_beats), str(write_status), *self._action]
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - our own module
-                child_command(__name__ if __name__ != "__main__" else "flowrec.rigs.lab.guardian", *command),
+            self._process = start_child(
+                "flowrec.rigs.lab.guardian",
+                *command,
                 pass_fds=(read_beats, write_status, *self._descriptors),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
-                start_new_session=True,
-                env=child_environment(),
             )
         except OSError as error:
             self._release()
@@ -108,8 +107,10 @@ class Guardian:
             for end in (self._beats, self._status):
                 os.set_blocking(end, False)
         if self._report(b"ready", _START_S) is None:
-            said = self._last_words()
+            self._process.kill()
+            lines = self._process.communicate()[1].decode(errors="replace").strip().splitlines()
             self._release()
+            said = lines[-1] if lines else "it says nothing"
             raise RigError(f"the guardian process does not start: {said}; nothing is energised")
         return self
 
@@ -187,13 +188,6 @@ class Guardian:
             self._unanswered_s = None
             self._heard = (self._heard + said.replace(b".", b""))[-4096:]
         return True
-
-    def _last_words(self) -> str:
-        process = self._process
-        assert process is not None and process.stderr is not None
-        process.kill()
-        lines = process.stderr.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it says nothing"
 
     def _release(self) -> None:
         for end in (self._beats, self._status):

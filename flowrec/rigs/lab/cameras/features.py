@@ -49,6 +49,11 @@ class Features(Protocol):
         RigError : the device refuses.
         """
 
+    def value(self, name: str) -> Value | None:
+        """Its value; None if the device does not have it, or it can not be read."""
+        found = self.feature(name)
+        return found.value if found is not None else None
+
 
 def configure(device: Features, wanted: Wanted) -> CameraInfo:
     """Set a device that does not acquire; what it has then. The driver adds what the settings do not tell.
@@ -60,10 +65,15 @@ def configure(device: Features, wanted: Wanted) -> CameraInfo:
     notes: list[str] = []
     pixel_format = _pixel_format(device, wanted.pixel_format)
     width_px, height_px = _region(device, wanted)
-    _choose(device, ("AcquisitionMode",), "Continuous")
+    _choose(device, "AcquisitionMode", "Continuous")
     _trigger(device, wanted.trigger)
-    exposure_s = _exposure(device, wanted.exposure_s, notes)
-    gain = _gain(device, wanted.gain, notes)
+    _choose(device, "ExposureAuto", "Off")
+    _choose(device, "ExposureMode", "Timed")
+    exposures, asked_s = ("ExposureTime", "ExposureTimeAbs"), wanted.exposure_s or None
+    exposure_s = _set_number(device, exposures, "camera.exposure_s", asked_s, "s", notes, _US) or 0.0
+    if wanted.gain is not None:
+        _choose(device, "GainAuto", "Off")
+    gain = _set_number(device, ("Gain", "GainRaw", "GainAbs"), "lab.gain", wanted.gain, "", notes)
     rate_hz = _rate(device, wanted, notes)
     return CameraInfo(
         model="",
@@ -158,33 +168,21 @@ def _trigger(device: Features, asked: str) -> None:
     device.put("TriggerMode", "On")
 
 
-def _exposure(device: Features, asked_s: float, notes: list[str]) -> float:
-    """Set the exposure in s; returns what it is, 0 if the device does not say."""
-    _choose(device, ("ExposureAuto",), "Off")
-    _choose(device, ("ExposureMode",), "Timed")
-    name = _first(device, "ExposureTime", "ExposureTimeAbs")
-    if name is None:
-        notes.extend(difference("camera.exposure_s", asked_s or None, None, "s"))
-        return 0.0
-    if asked_s:
-        _put_clipped(device, name, asked_s / _US)
-    got_s = _number(device, name) * _US
-    notes.extend(difference("camera.exposure_s", asked_s or None, got_s, "s"))
-    return got_s
-
-
-def _gain(device: Features, asked: float | None, notes: list[str]) -> float | None:
-    """Set the gain; returns what it is, None if the device does not say."""
-    if asked is not None:
-        _choose(device, ("GainAuto",), "Off")
-    name = _first(device, "Gain", "GainRaw", "GainAbs")
-    if name is None:
-        notes.extend(difference("lab.gain", asked, None, ""))
-        return None
-    if asked is not None:
-        _put_clipped(device, name, asked)
-    got = _number(device, name)
-    notes.extend(difference("lab.gain", asked, got, ""))
+def _set_number(
+    device: Features,
+    names: tuple[str, ...],
+    key: str,
+    asked: float | None,
+    unit: str,
+    notes: list[str],
+    scale: float = 1.0,
+) -> float | None:
+    """Set a number that is asked for in `scale` units of the device; what it is, None if the device does not say."""
+    name = _first(device, *names)
+    if name is not None and asked is not None:
+        _put_clipped(device, name, asked / scale)
+    got = None if name is None else _number(device, name) * scale
+    notes.extend(difference(key, asked, got, unit))
     return got
 
 
@@ -210,14 +208,11 @@ def _rate(device: Features, wanted: Wanted, notes: list[str]) -> float:
 
 def _first(device: Features, *names: str) -> str | None:
     """The first of some names that the device has and that can be read."""
-    return next(
-        (name for name in names if (found := device.feature(name)) is not None and found.value is not None), None
-    )
+    return next((name for name in names if device.value(name) is not None), None)
 
 
 def _number(device: Features, name: str) -> float:
-    found = device.feature(name)
-    return float(found.value) if found is not None and found.value is not None else 0.0
+    return float(device.value(name) or 0.0)
 
 
 def _writable(feature: Feature | None) -> bool:
@@ -236,9 +231,8 @@ def _put_clipped(device: Features, name: str, value: float) -> None:
     device.put(name, value)
 
 
-def _choose(device: Features, names: tuple[str, ...], entry: str) -> None:
-    """Set those enumerations that the device has and that have the entry."""
-    for name in names:
-        have = device.feature(name)
-        if have is not None and have.writable and entry in have.entries and have.value != entry:
-            device.put(name, entry)
+def _choose(device: Features, name: str, entry: str) -> None:
+    """Set an enumeration, where the device has it and it has the entry."""
+    have = device.feature(name)
+    if have is not None and have.writable and entry in have.entries and have.value != entry:
+        device.put(name, entry)

@@ -15,7 +15,7 @@ import viva_genicam as vg
 
 from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
-from flowrec.rigs.lab.cameras.features import Feature, Value, configure
+from flowrec.rigs.lab.cameras.features import Feature, Features, Value, configure
 
 _DISCOVER_MS = 500
 _GIGE = "gige"
@@ -134,7 +134,7 @@ class GenicamCamera:
         return name, device
 
 
-class _GenicamNodes:
+class _GenicamNodes(Features):
     """The settings of a camera; see features.Features."""
 
     def __init__(self, camera: vg.Camera) -> None:
@@ -150,11 +150,6 @@ class _GenicamNodes:
         low, high, step = (state.range.min, state.range.max, state.range.inc) if state.range else (0.0, 0.0, 0.0)
         writable = state.access in ("RW", "WO")
         return Feature(state.value, low, high, step or 0.0, tuple(state.enum_entries or ()), writable)
-
-    def value(self, name: str) -> Value | None:
-        """Its value; None if the device does not have it."""
-        found = self.feature(name)
-        return found.value if found is not None else None
 
     def put(self, name: str, value: Value) -> None:
         try:

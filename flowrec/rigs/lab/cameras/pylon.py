@@ -16,7 +16,7 @@ with warnings.catch_warnings():
 
 from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
-from flowrec.rigs.lab.cameras.features import Feature, Value, configure
+from flowrec.rigs.lab.cameras.features import Feature, Features, Value, configure
 
 _BUFFERS = 32
 _EMULATOR = "BaslerCamEmu"
@@ -128,7 +128,7 @@ class PylonCamera:
                 self.device.Close()
 
 
-class _PylonNodes:
+class _PylonNodes(Features):
     """The settings of a camera; see features.Features."""
 
     def __init__(self, nodes: Any) -> None:
@@ -148,11 +148,6 @@ class _PylonNodes:
         value = node.GetValue() if hasattr(node, "GetValue") and genicam.IsReadable(node) else None
         entries = tuple(node.GetSettableValues()) if hasattr(node, "GetSettableValues") else ()
         return Feature(value, low, high, step, entries, genicam.IsWritable(node))
-
-    def value(self, name: str) -> Value | None:
-        """Its value; None if the device does not have it."""
-        found = self.feature(name)
-        return found.value if found is not None else None
 
     def put(self, name: str, value: Value) -> None:
         try:
