@@ -93,12 +93,7 @@ class MessageField:
         return self.shape is None or self.shape.finite
 
 
-_FIELDS: dict[type, tuple[MessageField, ...]] = {}
-# For Message.__post_init__, which runs often.
-_ARRAYS: dict[type, tuple[tuple[str, np.dtype[Any]], ...]] = {}
-_FINITE: dict[type, tuple[str, ...]] = {}
-
-
+@functools.cache
 def message_fields(message_type: type) -> tuple[MessageField, ...]:
     """The fields of a message type, in order.
 
@@ -106,9 +101,7 @@ def message_fields(message_type: type) -> tuple[MessageField, ...]:
     ------
     TypeError : an annotation that has no wire form.
     """
-    if message_type not in _FIELDS:
-        _FIELDS[message_type] = tuple(_declared_fields(message_type))
-    return _FIELDS[message_type]
+    return tuple(_declared_fields(message_type))
 
 
 def _declared_fields(message_type: type) -> Iterator[MessageField]:
@@ -142,20 +135,20 @@ def summary_of(message_type: type) -> str:
     return text.split(". ")[0].rstrip(".")
 
 
+@functools.cache
 def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
     """Name and dtype of each array field of a message type, in order."""
-    found = _ARRAYS.get(message_type)
-    if found is None:
-        found = tuple((each.name, each.dtype) for each in message_fields(message_type) if each.dtype is not None)
-        _ARRAYS[message_type] = found
-    return found
+    return tuple((each.name, each.dtype) for each in message_fields(message_type) if each.dtype is not None)
 
 
 @functools.cache
 def array_shapes(message_type: type) -> tuple[tuple[str, tuple[int | str, ...]], ...]:
     """Name and lengths of each array field of a message type whose declaration gives a shape, in order."""
-    declared = [each for each in message_fields(message_type) if each.dtype is not None]
-    return tuple((each.name, each.shape.lengths) for each in declared if each.shape is not None)
+    return tuple(
+        (each.name, each.shape.lengths)
+        for each in message_fields(message_type)
+        if each.dtype is not None and each.shape is not None
+    )
 
 
 def defaulted_fields(message_type: type) -> frozenset[str]:
@@ -232,13 +225,10 @@ class Message:
         return True
 
 
+@functools.cache
 def _finite_fields(message_type: type) -> tuple[str, ...]:
     """Names of the fields whose numbers may be NaN or infinite by their type only."""
-    found = _FINITE.get(message_type)
-    if found is None:
-        found = tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
-        _FINITE[message_type] = found
-    return found
+    return tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
 
 
 def _is_finite(value: float | NDArray[np.floating]) -> bool:

@@ -70,10 +70,8 @@ class ProcessWorker:
         Raises what the work has raised; FlowrecError if the process has ended, was stopped by a signal, or its answer
         can not be read.
         """
-        result = self._result() if self._fills else None
-        return {} if result is None else {self._fills.popleft(): replace(result, stamp_ns=stamp_ns)}
-
-    def _result(self) -> Result | None:
+        if not self._fills:
+            return {}
         try:
             result = self._results.get_nowait()
         except queue.Empty:
@@ -82,10 +80,10 @@ class ProcessWorker:
                     f"{_NAME} (process {self._process.pid}) was stopped by a signal, and the mission waits for it; "
                     "find out who sent it, then record again"
                 ) from None
-            return None
+            return {}
         if isinstance(result, Exception):
             raise result
-        return result
+        return {self._fills.popleft(): replace(result, stamp_ns=stamp_ns)}
 
     def close(self) -> None:
         """End the process at once, its threads and pipes."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import FlowError, FlowField
 from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, median_width_um, with_settings
-from flowrec.rigs.simulated.hindrance import Hindrance, walls_around
+from flowrec.rigs.simulated.hindrance import NO_HINDRANCE, Hindrance, walls_around
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.true_walls import at_centres, on_pixels, origin_um, true_walls
 from flowrec.stages import Simulated
@@ -164,7 +164,7 @@ class World:
     mask: NDArray[np.bool_]  # of the true walls, which the microscope shows
     mask_um_per_px: float
     mask_origin_um: float  # where the centre of its first pixel lies, on either axis of the chip frame
-    hindrance: Hindrance | None
+    hindrance: Hindrance
 
 
 def world_of(
@@ -203,7 +203,7 @@ def world_of(
     if walls_um is None:
         walls_um = clearance_um(chip.mask, chip.um_per_px)
     share = simulated.value("hindrance")
-    hindrance = Hindrance(share, walls_around(walls_um, chip.um_per_px)) if share > 0.0 else None
+    hindrance = Hindrance(share, walls_around(walls_um, chip.um_per_px)) if share > 0.0 else NO_HINDRANCE
     return World(field, walls_um, mask, um_per_px, mask_origin_um, hindrance)
 
 
