@@ -19,7 +19,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from enum import Enum
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,13 +195,15 @@ class Message:
 
     def refuse_not_finite(self) -> None:
         """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
-        for name in _finite_fields(type(self)):
+        kind: type = type(self)
+        for name in _finite_fields(kind):
             value = getattr(self, name)
             if value is not None and not _is_finite(value):
                 raise NotFiniteError(_refusal(self))
 
     def _set_arrays(self) -> None:
-        for name, dtype in array_fields(type(self)):
+        kind: type = type(self)
+        for name, dtype in array_fields(kind):
             given = getattr(self, name)
             if given is None:
                 continue
@@ -280,8 +282,8 @@ def shape_fault(message_type: type, shape_of: Callable[[str], tuple[int, ...] | 
 
 def invalid_numbers(message: Message, limit: float | None = None) -> tuple[str, ...]:
     """Names of the fields that hold NaN or infinity where these are excluded, or a finite number of `limit` or more."""
-    found = []
-    for each in message_fields(type(message)):
+    found, kind = [], cast(type, type(message))
+    for each in message_fields(kind):
         value = getattr(message, each.name)
         if value is None or not each.is_float:
             continue

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from flowrec.core.clocks import read_clocks
+from flowrec.core.clocks.clock_monitor import read_clocks
 from flowrec.core.version import NUMERICS_VERSION, __version__
 
 PACKAGES = (

@@ -60,12 +60,13 @@ def start_child(
     ------
     OSError : it does not start.
     """
-    return subprocess.Popen(  # noqa: S603 - our own module
+    process: subprocess.Popen[Any] = subprocess.Popen(  # noqa: S603 - our own module
         child_command(module, *words),
         start_new_session=True,
         env=child_environment() | dict(environment or {}),
         **({"stdin": subprocess.PIPE, "stdout": subprocess.PIPE} | given),
     )
+    return process
 
 
 @contextmanager

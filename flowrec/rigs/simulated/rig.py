@@ -33,8 +33,7 @@ from flowrec.core import (
 from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.rigs.simulated.true_coils import TrueCoils
-from flowrec.rigs.simulated.world import Shake, World, misregister, true_pump, true_robot, world_of
+from flowrec.rigs.simulated.world import Shake, TrueCoils, World, misregister, true_pump, true_robot, world_of
 from flowrec.stages import (
     Coils,
     FieldCommand,

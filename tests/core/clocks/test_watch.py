@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.clocks import ClockMonitor, read_clocks
+from flowrec.core.clocks.clock_monitor import ClockMonitor, read_clocks
 from flowrec.core.clocks.device_clock import SLEW
 from flowrec.core.errors import RigError
 from flowrec.core.system.outputs import MCAP, Output
@@ -187,7 +187,7 @@ time_t time(time_t *to) {
 CHILD = """
 import sys, time
 from dataclasses import replace
-from flowrec.core.clocks import ClockMonitor
+from flowrec.core.clocks.clock_monitor import ClockMonitor
 from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 

@@ -54,6 +54,10 @@ class Features(Protocol):
         found = self.feature(name)
         return found.value if found is not None else None
 
+    def id_bits(self, gige: bool) -> int:
+        """Length of the block ids: GigE Vision has short ones, unless the extended ones are switched on."""
+        return 16 if gige and self.value("GevGVSPExtendedIDMode") != "On" else 64
+
 
 def configure(device: Features, wanted: Wanted) -> CameraInfo:
     """Set a device that does not acquire; what it has then. The driver adds what the settings do not tell.

@@ -62,12 +62,11 @@ class GenicamCamera:
             stream = camera.stream(deliver_incomplete=True, auto_packet_size=camera.transport == _GIGE)
             self._stream = stream.__enter__()
             self._stack.callback(_quietly, stream.__exit__, None, None, None)
-            extended = nodes.value("GevGVSPExtendedIDMode") == "On"
             return replace(
                 settled,
                 model=f"{nodes.value('DeviceVendorName') or ''} {nodes.value('DeviceModelName') or name}".strip(),
                 serial=str(nodes.value("DeviceSerialNumber") or nodes.value("DeviceID") or ""),
-                id_bits=16 if camera.transport == _GIGE and not extended else 64,
+                id_bits=nodes.id_bits(camera.transport == _GIGE),
                 ticks_per_s=_ticks_per_s(camera, nodes),
             )
         except vg.GenicamError as error:

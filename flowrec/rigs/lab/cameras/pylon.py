@@ -74,13 +74,11 @@ class PylonCamera:
         self._bits = settled.bits
         self.device.MaxNumBuffer.Value = _BUFFERS
         self.device.StartGrabbing(pylon.GrabStrategy_OneByOne)
-        gige = about.GetDeviceClass() == _GIGE
-        extended = features.value("GevGVSPExtendedIDMode") == "On"
         return replace(
             settled,
             model=f"{about.GetVendorName()} {about.GetModelName()}",
             serial=about.GetSerialNumber(),
-            id_bits=16 if gige and not extended else 64,
+            id_bits=features.id_bits(about.GetDeviceClass() == _GIGE),
             ticks_per_s=0.0 if self._emulated else float(features.value("GevTimestampTickFrequency") or _NS),
         )
 
