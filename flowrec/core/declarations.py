@@ -19,7 +19,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from enum import Enum
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from flowrec.core.enums import WorkOrder
 from flowrec.core.errors import NotFiniteError
 from flowrec.core.units import seconds
+
+Result = TypeVar("Result")
 
 # The annotation is the wire form: a `vector` becomes a repeated double that viewers can plot,
 # an `array` keeps its shape and its bytes.
@@ -93,7 +95,12 @@ class MessageField:
         return self.shape is None or self.shape.finite
 
 
-@functools.cache
+def _kept(function: Callable[[type], Result]) -> Callable[[type], Result]:
+    """Keep what a function of a message type returns. mypy takes no class without a hash of its own for a key."""
+    return functools.cache(function)
+
+
+@_kept
 def message_fields(message_type: type) -> tuple[MessageField, ...]:
     """The fields of a message type, in order.
 
@@ -135,13 +142,13 @@ def summary_of(message_type: type) -> str:
     return text.split(". ")[0].rstrip(".")
 
 
-@functools.cache
+@_kept
 def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
     """Name and dtype of each array field of a message type, in order."""
     return tuple((each.name, each.dtype) for each in message_fields(message_type) if each.dtype is not None)
 
 
-@functools.cache
+@_kept
 def array_shapes(message_type: type) -> tuple[tuple[str, tuple[int | str, ...]], ...]:
     """Name and lengths of each array field of a message type whose declaration gives a shape, in order."""
     return tuple(
@@ -189,21 +196,7 @@ class Message:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        self._set_arrays()
-        if not _READING.depth:
-            self.refuse_not_finite()
-
-    def refuse_not_finite(self) -> None:
-        """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
-        kind: type = type(self)
-        for name in _finite_fields(kind):
-            value = getattr(self, name)
-            if value is not None and not _is_finite(value):
-                raise NotFiniteError(_refusal(self))
-
-    def _set_arrays(self) -> None:
-        kind: type = type(self)
-        for name, dtype in array_fields(kind):
+        for name, dtype in array_fields(type(self)):
             given = getattr(self, name)
             if given is None:
                 continue
@@ -212,6 +205,15 @@ class Message:
                 array = array.view()
                 array.flags.writeable = False
             object.__setattr__(self, name, array)
+        if not _READING.depth:
+            self.refuse_not_finite()
+
+    def refuse_not_finite(self) -> None:
+        """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
+        for name in _finite_fields(type(self)):
+            value = getattr(self, name)
+            if value is not None and not _is_finite(value):
+                raise NotFiniteError(_refusal(self))
 
     def same_as(self, other: object) -> bool:
         """True if the other record is the same bit for bit (NaN equals NaN)."""
@@ -227,7 +229,7 @@ class Message:
         return True
 
 
-@functools.cache
+@_kept
 def _finite_fields(message_type: type) -> tuple[str, ...]:
     """Names of the fields whose numbers may be NaN or infinite by their type only."""
     return tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
@@ -282,8 +284,8 @@ def shape_fault(message_type: type, shape_of: Callable[[str], tuple[int, ...] | 
 
 def invalid_numbers(message: Message, limit: float | None = None) -> tuple[str, ...]:
     """Names of the fields that hold NaN or infinity where these are excluded, or a finite number of `limit` or more."""
-    found, kind = [], cast(type, type(message))
-    for each in message_fields(kind):
+    found = []
+    for each in message_fields(type(message)):
         value = getattr(message, each.name)
         if value is None or not each.is_float:
             continue

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.declarations import NOT_STATED, Matrix, Message, NanFloat, Shape, Vector, Vector2
+from flowrec.core.declarations import NOT_STATED, Matrix, Message, NanFloat, Shape, Vector, Vector2, array_fields
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,26 +101,16 @@ class Observations(Message):
 
     def only(self, which: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some of the observations, chosen by an index of arrays."""
-        return Observations(
-            self.stamp_ns,
-            self.position_um[which],
-            self.flow_um_s[which],
-            self.std_um_s[which],
-            None if self.rolled_um_s is None else self.rolled_um_s[which],
-            None if self.time_s is None else self.time_s[which],
-            self.radius_um,
-        )
+        stated = {name: array for name, array in self._arrays().items() if array is not None}
+        return replace(self, **{name: array[which] for name, array in stated.items()})
 
     def followed_by(self, more: Observations) -> Observations:
         """These observations, then more; the stamp is that of the later ones. What one does not state, both do not."""
-        rolled = (self.rolled_um_s, more.rolled_um_s)
-        time = (self.time_s, more.time_s)
-        return Observations(
-            more.stamp_ns,
-            np.concatenate((self.position_um, more.position_um)),
-            np.concatenate((self.flow_um_s, more.flow_um_s)),
-            np.concatenate((self.std_um_s, more.std_um_s)),
-            None if rolled[0] is None or rolled[1] is None else np.concatenate((rolled[0], rolled[1])),
-            None if time[0] is None or time[1] is None else np.concatenate((time[0], time[1])),
-            more.radius_um if self.radius_um == more.radius_um else None,
-        )
+        pairs = {name: (array, more._arrays()[name]) for name, array in self._arrays().items()}
+        joined = {
+            name: None if any(each is None for each in pair) else np.concatenate(pair) for name, pair in pairs.items()
+        }
+        return replace(more, radius_um=more.radius_um if self.radius_um == more.radius_um else None, **joined)
+
+    def _arrays(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name, _ in array_fields(Observations)}

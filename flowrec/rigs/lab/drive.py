@@ -90,7 +90,12 @@ class Drive:
             self.info = self._amplifier.open()
             stack.callback(self._amplifier.close)
             self._limits.check(self.info)
-            self._check_beats()
+            shortest_s = min(filter(None, (self._silence_s, self.info.timer_s)))
+            if shortest_s < 2.0 * BEAT_S:
+                raise UsageError(
+                    f"lab.guardian_s or the amplifier's timer = {shortest_s:g} s: the loop beats every {BEAT_S:g} s; "
+                    f"at least {2.0 * BEAT_S:g} s are needed"
+                )
             made = self._make_guardian(*self._amplifier.guard(), silence_s=self._silence_s)
             self._guardian = stack.enter_context(made)
             self._amplifier.arm()
@@ -185,14 +190,6 @@ class Drive:
             raise
         if self._taken_away and command.amplitude_mt > 0.0:  # zero() came while the command was on its way
             self._amplifier.zero()
-
-    def _check_beats(self) -> None:
-        shortest_s = min(filter(None, (self._silence_s, self.info.timer_s)))
-        if shortest_s < 2.0 * BEAT_S:
-            raise UsageError(
-                f"lab.guardian_s or the amplifier's timer = {shortest_s:g} s: the loop beats every {BEAT_S:g} s; at "
-                f"least {2.0 * BEAT_S:g} s are needed"
-            )
 
 
 @dataclass(frozen=True, slots=True)

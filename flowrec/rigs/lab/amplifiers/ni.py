@@ -174,15 +174,18 @@ class NiAmplifier:
 
     def _hear(self) -> None:
         """Take in what the process reports. Does not wait."""
-        while self._connection is not None and not self._fault:
-            try:
-                if not self._connection.poll():
-                    return
-                self._report(*self._connection.recv())
-            except (EOFError, OSError):
-                self._fault = "its process has ended"
+        while self._connection is not None and not self._fault and self._report(0.0) is not None:
+            pass
 
-    def _report(self, what: str, *given: Any) -> tuple[str, Any]:
+    def _report(self, timeout_s: float) -> tuple[str, Any] | None:
+        """Take in the next report, which is returned; None: there is none in that time, or the process has ended."""
+        try:
+            if not self._connection.poll(timeout_s):
+                return None
+            what, *given = self._connection.recv()
+        except (EOFError, OSError):
+            self._fault = "its process has ended"
+            return None
         if what == "block":
             self._played.append(given[0])
             self._played_s = time.monotonic()
@@ -193,17 +196,15 @@ class NiAmplifier:
         return what, given[0] if given else None
 
     def _wait(self, wanted: str, timeout_s: float) -> Any:
-        assert self._connection is not None
         end_s = time.monotonic() + timeout_s
         while not self._fault:
-            if not self._connection.poll(max(end_s - time.monotonic(), 0.0)):
+            report = self._report(max(end_s - time.monotonic(), 0.0))
+            if report is not None and report[0] == wanted:
+                return report[1]
+            if report is None and not self._fault:
                 raise RigError(f"the process of the NI output does not answer in {timeout_s:g} s")
-            try:
-                what, given = self._report(*self._connection.recv())
-            except (EOFError, OSError) as error:
-                raise RigError("the process of the NI output has ended") from error
-            if what == wanted:
-                return given
+            if report is None:
+                raise RigError("the process of the NI output has ended")
         raise RigError(self._fault)
 
     def _log_played(self, before_ns: int) -> None:

@@ -263,11 +263,8 @@ class SerialAmplifier:
 
     # ---- the reader's thread
 
+    @realtime_priority(Priority.DEVICE)  # what it reads is stamped on arrival
     def _read(self) -> None:
-        with realtime_priority(Priority.DEVICE):  # what it reads is stamped on arrival
-            self._read_lines()
-
-    def _read_lines(self) -> None:
         assert self._port is not None
         descriptor, rest = self._port.fileno(), b""
         while not self._closing:
