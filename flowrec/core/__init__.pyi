@@ -84,7 +84,8 @@ from .system.numba_setup import compiled as compiled, kernels_cached as kernels_
 from .system.output_folder import OutputFolder as OutputFolder, marker_of as marker_of
 from .system.outputs import (
     FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, Output as Output, OutputError as OutputError, PICTURE as PICTURE,
-    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, name_taken as name_taken,
+    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, name_taken as name_taken, note_written as note_written,
+    written_sha256 as written_sha256,
 )
 from .system.processes import (
     Priority as Priority, child_command as child_command, child_environment as child_environment,
@@ -96,7 +97,6 @@ from .system.regular_file import refuse_irregular as refuse_irregular
 from .system.stderr import said_within as said_within
 from .system.table_file import DATES as DATES, TIME_UNITS as TIME_UNITS, Table as Table, read_table as read_table
 from .system.toml_file import parse_toml as parse_toml, read_toml as read_toml
-from .system.written import note_written as note_written, written_sha256 as written_sha256
 from .terminal import (
     Progress as Progress, console as console, looked_at as looked_at, outlet as outlet, progress as progress,
     say as say, table as table, warn as warn, width as width,

@@ -158,8 +158,7 @@ def _refuse_unfit(topic: Topic) -> None:
 def declaration(topic: Topic) -> str:
     """The declaration of an extra topic as JSON: source, tolerances, and all fields of its message type."""
     kind: Any = topic.type
-    defaults = {each.name: made for each in fields(kind) if (made := _default_as_json(each)) is not MISSING}
-    stated = [_field_as_json(each, defaults.get(each.name, MISSING)) for each in message_fields(kind)]
+    stated = [_field_as_json(*pair) for pair in zip(message_fields(kind), fields(kind), strict=True)]
     return json.dumps(
         {
             "type": kind.__name__,
@@ -172,7 +171,7 @@ def declaration(topic: Topic) -> str:
     )
 
 
-def _field_as_json(each: MessageField, default: Any) -> dict[str, Any]:
+def _field_as_json(each: MessageField, of_type: Any) -> dict[str, Any]:
     kind = getattr(each.kind, "__name__", each.kind)
     stated: dict[str, Any] = {"name": each.name, "kind": kind, "meaning": each.meaning}
     if each.dtype is not None and each.shape is not None:
@@ -181,7 +180,7 @@ def _field_as_json(each: MessageField, default: Any) -> dict[str, Any]:
         stated["finite"] = False
     if each.optional:
         stated["optional"] = True
-    if default is not MISSING:
+    if (default := _default_as_json(of_type)) is not MISSING:
         stated["default"] = default
     return stated
 

@@ -17,8 +17,7 @@ from typing import Any
 from flowrec.core.errors import SessionError
 from flowrec.core.system.durable import sync_directory, sync_file
 from flowrec.core.system.leftovers import MARKER, OLD, remove_leftovers_once, temporary_name
-from flowrec.core.system.outputs import OutputError, name_taken
-from flowrec.core.system.written import sha256_of
+from flowrec.core.system.outputs import OutputError, name_taken, sha256_of
 
 _WRITTEN = "sha256"  # of the files of a folder, by name
 
