@@ -32,7 +32,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Self
 
 from flowrec.core import Priority, RigError, prioritise_process, start_child
@@ -239,7 +238,7 @@ def main(arguments: Sequence[str]) -> int:
     os.set_blocking(status, False)
     _say(status, "ready")
     cause = watch(
-        partial(_read_beats, beats),
+        lambda timeout_s: os.read(beats, 4096) if select.select([beats], [], [], timeout_s)[0] else None,
         silence_s,
         lambda: _say(status, ".", end=""),
         lambda: _say(status, f"probed {_try(zero)}"),
@@ -250,11 +249,6 @@ def main(arguments: Sequence[str]) -> int:
     how = _try(zero)
     _say(status, f"tripped {cause}; {how} in {1e3 * (time.monotonic() - begin_s):.0f} ms")
     return 3
-
-
-def _read_beats(beats: int, timeout_s: float | None) -> bytes | None:
-    """Read from the recorder; b'' at the end of its pipe; None: nothing in that time."""
-    return os.read(beats, 4096) if select.select([beats], [], [], timeout_s)[0] else None
 
 
 def watch(
@@ -268,7 +262,8 @@ def watch(
 
     Parameters
     ----------
-    heard : waits at most so many seconds (None: for ever) for what the recorder says, see `_heard`.
+    heard : waits at most so many seconds (None: for ever) for what the recorder says; b'' at the end of its pipe, None:
+        nothing in that time.
     silence_s : longest time between beats while a field is on.
     answer, probe : called after each beat, and when a probe is asked for.
     clock : monotonic time in s.

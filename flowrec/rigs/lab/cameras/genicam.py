@@ -15,7 +15,7 @@ import viva_genicam as vg
 
 from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
-from flowrec.rigs.lab.cameras.features import Feature, Features, Value, configure
+from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
 _DISCOVER_MS = 500
 _GIGE = "gige"
@@ -140,12 +140,12 @@ class _GenicamNodes(Features):
         self._camera = camera
         self._names = frozenset(camera.nodes())
 
-    def feature(self, name: str) -> Feature | None:
+    def feature(self, name: str) -> Feature:
         if name not in self._names:
-            return None
+            return ABSENT
         state = self._camera.feature_state(name)
         if not (state.is_implemented and state.is_available):
-            return None
+            return ABSENT
         low, high, step = (state.range.min, state.range.max, state.range.inc) if state.range else (0.0, 0.0, 0.0)
         writable = state.access in ("RW", "WO")
         return Feature(state.value, low, high, step or 0.0, tuple(state.enum_entries or ()), writable)

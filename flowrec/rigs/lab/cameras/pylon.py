@@ -16,7 +16,7 @@ with warnings.catch_warnings():
 
 from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
-from flowrec.rigs.lab.cameras.features import Feature, Features, Value, configure
+from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
 _BUFFERS = 32
 _EMULATOR = "BaslerCamEmu"
@@ -133,12 +133,12 @@ class _PylonNodes(Features):
         self._nodes = nodes
         self._names = frozenset(node.GetNode().GetName() for node in nodes.GetNodes())
 
-    def feature(self, name: str) -> Feature | None:
+    def feature(self, name: str) -> Feature:
         if name not in self._names:
-            return None
+            return ABSENT
         node = self._nodes.GetNode(name)
         if not genicam.IsAvailable(node):
-            return None
+            return ABSENT
         low, high, step = 0.0, 0.0, 0.0
         if hasattr(node, "GetMin"):
             low, high = node.GetMin(), node.GetMax()
