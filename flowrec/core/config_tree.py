@@ -158,7 +158,7 @@ def place_paths(tree: dict[str, Any], file: Path) -> None:
 
 def type_error(root: type, key: str, value: Any, complaint: str) -> str:
     """The error text for a value of the wrong type, with the nearest valid value."""
-    known = dict(_all_hints(root, ""))
+    known = dict(_all_hints(root))
     while key not in known and "." in key:  # a place in a tuple
         key = key.rpartition(".")[0]
     hint = known.get(key)
@@ -195,7 +195,7 @@ def refuse_unknown(
     for key, value in tree.items():
         name = prefix + key
         if key not in known:
-            near = difflib.get_close_matches(name, [each for each, _ in _all_hints(root, "")], n=1, cutoff=0.5)
+            near = difflib.get_close_matches(name, [each for each, _ in _all_hints(root)], n=1, cutoff=0.5)
             hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + each for each in known)}"
             raise UsageError(f"{origin(name)}: unknown key {name}; {hint}")
         inner = known[key]
@@ -205,7 +205,7 @@ def refuse_unknown(
             refuse_unknown(value, root, origin, inner, f"{name}.")
 
 
-def _all_hints(section: type, prefix: str) -> Iterable[tuple[str, Any]]:
+def _all_hints(section: type, prefix: str = "") -> Iterable[tuple[str, Any]]:
     """Every key of the configuration with its type, sections included."""
     for key, inner in hints(section).items():
         yield prefix + key, inner
