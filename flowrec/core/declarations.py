@@ -95,12 +95,12 @@ class MessageField:
         return self.shape is None or self.shape.finite
 
 
-def _kept(function: Callable[[type], Result]) -> Callable[[type], Result]:
+def _keep(function: Callable[[type], Result]) -> Callable[[type], Result]:
     """Keep what a function of a message type returns. mypy takes no class without a hash of its own for a key."""
     return functools.cache(function)
 
 
-@_kept
+@_keep
 def message_fields(message_type: type) -> tuple[MessageField, ...]:
     """The fields of a message type, in order.
 
@@ -142,13 +142,13 @@ def summary_of(message_type: type) -> str:
     return text.split(". ")[0].rstrip(".")
 
 
-@_kept
+@_keep
 def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
     """Name and dtype of each array field of a message type, in order."""
     return tuple((each.name, each.dtype) for each in message_fields(message_type) if each.dtype is not None)
 
 
-@_kept
+@_keep
 def array_shapes(message_type: type) -> tuple[tuple[str, tuple[int | str, ...]], ...]:
     """Name and lengths of each array field of a message type whose declaration gives a shape, in order."""
     return tuple(
@@ -229,7 +229,7 @@ class Message:
         return True
 
 
-@_kept
+@_keep
 def _finite_fields(message_type: type) -> tuple[str, ...]:
     """Names of the fields whose numbers may be NaN or infinite by their type only."""
     return tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)

@@ -51,7 +51,7 @@ class ChildProcess:
         return pickle.load(self.process.stdout)  # noqa: S301 - from our own process
 
     def cause(self) -> str:
-        """How it has ended, as "killed by SIGKILL" or "exit status 1"."""
+        """The way in which it has ended, as "killed by SIGKILL" or "exit status 1"."""
         try:
             status = self.process.wait(_JOIN_S)
         except subprocess.TimeoutExpired:
