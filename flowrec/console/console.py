@@ -155,7 +155,7 @@ class Console:
                 limit = words["limit_um_s"]
                 self._control.limit_speed(None if limit is None else float(limit))
             else:
-                taken = COMMANDS[name].give(self._control, words["text"], "console")
+                taken = COMMANDS[name].give(self._control, words["text"], "console") is not False
         except FlowrecError as error:  # a place or speed that no run could have
             self._tell(f"console: {error}")
             return str(error)

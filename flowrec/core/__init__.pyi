@@ -31,7 +31,6 @@ from .errors import (
     NotFiniteError as NotFiniteError, RigError as RigError, SessionError as SessionError,
     UnreachableError as UnreachableError, UsageError as UsageError, printable as printable,
 )
-from .field_views import VALUES as VALUES, values_of as values_of
 from .interpolation import (
     bilinear as bilinear, bilinear_known as bilinear_known, cell_at as cell_at, cells_at as cells_at,
     corner_weights as corner_weights, nearest_pixel as nearest_pixel, nearest_pixels as nearest_pixels,
@@ -43,6 +42,7 @@ from .messages import (
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )
+from .messages.slow_stages import VALUES as VALUES, values_of as values_of
 from .methods import (
     ListedMethod as ListedMethod, Method as Method, Methods as Methods, OWN as OWN, REPLAYED as REPLAYED,
     table_at as table_at,
@@ -63,6 +63,7 @@ from .summary import (
 )
 from .system.blas_threads import one_blas_thread as one_blas_thread
 from .system.bounded_process import BoundedProcess as BoundedProcess
+from .system.child_process import ChildProcess as ChildProcess, Parent as Parent
 from .system.durable import (
     append_line as append_line, put_in_place as put_in_place, replace_content as replace_content,
     replacing as replacing, sync_directory as sync_directory, write_all as write_all,
@@ -83,18 +84,19 @@ from .system.numba_setup import compiled as compiled, kernels_cached as kernels_
 from .system.output_folder import OutputFolder as OutputFolder, marker_of as marker_of
 from .system.outputs import (
     FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, Output as Output, OutputError as OutputError, PICTURE as PICTURE,
-    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, name_taken as name_taken,
+    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, name_taken as name_taken, note_written as note_written,
+    written_sha256 as written_sha256,
 )
 from .system.processes import (
     Priority as Priority, child_command as child_command, child_environment as child_environment,
     forget_peak as forget_peak, peak_mb as peak_mb, pool as pool, prioritise_process as prioritise_process,
     prioritise_thread as prioritise_thread, realtime_priority as realtime_priority,
+    start_child as start_child,
 )
 from .system.regular_file import refuse_irregular as refuse_irregular
 from .system.stderr import said_within as said_within
 from .system.table_file import DATES as DATES, TIME_UNITS as TIME_UNITS, Table as Table, read_table as read_table
 from .system.toml_file import parse_toml as parse_toml, read_toml as read_toml
-from .system.written import note_written as note_written, written_sha256 as written_sha256
 from .terminal import (
     Progress as Progress, console as console, looked_at as looked_at, outlet as outlet, progress as progress,
     say as say, table as table, warn as warn, width as width,

@@ -101,8 +101,13 @@ def _plain(key: str, value: Any) -> Any:
 
 def apply_sets(tree: dict[str, Any], sets: Mapping[str, Any]) -> dict[str, str]:
     """Put each setting into the tree; returns the flag by key."""
-    for key, value in sets.items():
-        _put(tree, key.split("."), value)
+    for setting, value in sets.items():
+        section, (*keys, last) = tree, setting.split(".")
+        for key in keys:
+            section = section.setdefault(key, {})
+            if not isinstance(section, dict):
+                raise UsageError(f"--set {setting}: {key!r} is a value, not a section")
+        section[last] = value
     return dict.fromkeys(sets, "--set")
 
 
@@ -151,18 +156,9 @@ def place_paths(tree: dict[str, Any], file: Path) -> None:
         table[name] = str(placed)  # type: ignore[index]
 
 
-def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
-    for key in keys[:-1]:
-        inner = tree.setdefault(key, {})
-        if not isinstance(inner, dict):
-            raise UsageError(f"--set {'.'.join(keys)}: {key!r} is a value, not a section")
-        tree = inner
-    tree[keys[-1]] = value
-
-
 def type_error(root: type, key: str, value: Any, complaint: str) -> str:
     """The error text for a value of the wrong type, with the nearest valid value."""
-    known = dict(_all_hints(root, ""))
+    known = dict(_all_hints(root))
     while key not in known and "." in key:  # a place in a tuple
         key = key.rpartition(".")[0]
     hint = known.get(key)
@@ -186,27 +182,30 @@ def _names_of(hint: Any) -> list[str]:
     return [name for part in get_args(hint) for name in _names_of(part)]
 
 
-def refuse_unknown(tree: Mapping[str, Any], root: type, origin: Origin) -> None:
-    """Raise UsageError for the first key of a tree that the configuration `root` does not have."""
-    _refuse_unknown(tree, root, root, "", origin)
+def refuse_unknown(
+    tree: Mapping[str, Any], root: type, origin: Origin, section: type | None = None, prefix: str = ""
+) -> None:
+    """Raise UsageError for the first key of a tree that the configuration `root` does not have.
 
-
-def _refuse_unknown(tree: Mapping[str, Any], root: type, section: type, prefix: str, origin: Origin) -> None:
-    known = hints(section)
+    Parameters
+    ----------
+    section, prefix : of `root`, which the tree is of; None: all of it.
+    """
+    known = hints(section or root)
     for key, value in tree.items():
+        name = prefix + key
         if key not in known:
-            near = difflib.get_close_matches(prefix + key, [key for key, _ in _all_hints(root, "")], n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + name for name in known)}"
-            raise UsageError(f"{origin(prefix + key)}: unknown key {prefix + key}; {hint}")
+            near = difflib.get_close_matches(name, [each for each, _ in _all_hints(root)], n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + each for each in known)}"
+            raise UsageError(f"{origin(name)}: unknown key {name}; {hint}")
         inner = known[key]
         if is_dataclass(inner) and isinstance(inner, type):
             if not isinstance(value, dict):
-                where = origin(prefix + key)
-                raise UsageError(f"{where}: {prefix + key} is a section, not a value; set one of its keys")
-            _refuse_unknown(value, root, inner, f"{prefix}{key}.", origin)
+                raise UsageError(f"{origin(name)}: {name} is a section, not a value; set one of its keys")
+            refuse_unknown(value, root, origin, inner, f"{name}.")
 
 
-def _all_hints(section: type, prefix: str) -> Iterable[tuple[str, Any]]:
+def _all_hints(section: type, prefix: str = "") -> Iterable[tuple[str, Any]]:
     """Every key of the configuration with its type, sections included."""
     for key, inner in hints(section).items():
         yield prefix + key, inner

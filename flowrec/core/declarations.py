@@ -19,7 +19,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from enum import Enum
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from flowrec.core.enums import WorkOrder
 from flowrec.core.errors import NotFiniteError
 from flowrec.core.units import seconds
+
+Result = TypeVar("Result")
 
 # The annotation is the wire form: a `vector` becomes a repeated double that viewers can plot,
 # an `array` keeps its shape and its bytes.
@@ -59,6 +61,7 @@ Vector2 = Annotated[Vector, Shape(2)]
 COILS = "coils"  # a length that is the number of coils of the run
 PerCoil = Annotated[Vector, Shape(COILS)]
 NanFloat = Annotated[float, Shape(finite=False)]  # a number for which NaN or infinity has a meaning
+NOT_STATED: Any = ()  # default of a vector, which the message makes (0,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +95,12 @@ class MessageField:
         return self.shape is None or self.shape.finite
 
 
-_FIELDS: dict[type, tuple[MessageField, ...]] = {}
-# For Message.__post_init__, which runs often.
-_ARRAYS: dict[type, tuple[tuple[str, np.dtype[Any]], ...]] = {}
-_FINITE: dict[type, tuple[str, ...]] = {}
+def _keep(function: Callable[[type], Result]) -> Callable[[type], Result]:
+    """Keep what a function of a message type returns. mypy takes no class without a hash of its own for a key."""
+    return functools.cache(function)
 
 
+@_keep
 def message_fields(message_type: type) -> tuple[MessageField, ...]:
     """The fields of a message type, in order.
 
@@ -105,9 +108,7 @@ def message_fields(message_type: type) -> tuple[MessageField, ...]:
     ------
     TypeError : an annotation that has no wire form.
     """
-    if message_type not in _FIELDS:
-        _FIELDS[message_type] = tuple(_declared_fields(message_type))
-    return _FIELDS[message_type]
+    return tuple(_declared_fields(message_type))
 
 
 def _declared_fields(message_type: type) -> Iterator[MessageField]:
@@ -141,20 +142,20 @@ def summary_of(message_type: type) -> str:
     return text.split(". ")[0].rstrip(".")
 
 
+@_keep
 def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
     """Name and dtype of each array field of a message type, in order."""
-    found = _ARRAYS.get(message_type)
-    if found is None:
-        found = tuple((each.name, each.dtype) for each in message_fields(message_type) if each.dtype is not None)
-        _ARRAYS[message_type] = found
-    return found
+    return tuple((each.name, each.dtype) for each in message_fields(message_type) if each.dtype is not None)
 
 
-@functools.cache
+@_keep
 def array_shapes(message_type: type) -> tuple[tuple[str, tuple[int | str, ...]], ...]:
     """Name and lengths of each array field of a message type whose declaration gives a shape, in order."""
-    declared = [each for each in message_fields(message_type) if each.dtype is not None]
-    return tuple((each.name, each.shape.lengths) for each in declared if each.shape is not None)
+    return tuple(
+        (each.name, each.shape.lengths)
+        for each in message_fields(message_type)
+        if each.dtype is not None and each.shape is not None
+    )
 
 
 def defaulted_fields(message_type: type) -> frozenset[str]:
@@ -195,18 +196,6 @@ class Message:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        self._set_arrays()
-        if not _READING.depth:
-            self.refuse_not_finite()
-
-    def refuse_not_finite(self) -> None:
-        """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
-        for name in _finite_fields(type(self)):
-            value = getattr(self, name)
-            if value is not None and not _is_finite(value):
-                raise NotFiniteError(_refusal(self))
-
-    def _set_arrays(self) -> None:
         for name, dtype in array_fields(type(self)):
             given = getattr(self, name)
             if given is None:
@@ -216,6 +205,15 @@ class Message:
                 array = array.view()
                 array.flags.writeable = False
             object.__setattr__(self, name, array)
+        if not _READING.depth:
+            self.refuse_not_finite()
+
+    def refuse_not_finite(self) -> None:
+        """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
+        for name in _finite_fields(type(self)):
+            value = getattr(self, name)
+            if value is not None and not _is_finite(value):
+                raise NotFiniteError(_refusal(self))
 
     def same_as(self, other: object) -> bool:
         """True if the other record is the same bit for bit (NaN equals NaN)."""
@@ -231,13 +229,10 @@ class Message:
         return True
 
 
+@_keep
 def _finite_fields(message_type: type) -> tuple[str, ...]:
     """Names of the fields whose numbers may be NaN or infinite by their type only."""
-    found = _FINITE.get(message_type)
-    if found is None:
-        found = tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
-        _FINITE[message_type] = found
-    return found
+    return tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
 
 
 def _is_finite(value: float | NDArray[np.floating]) -> bool:

@@ -61,9 +61,8 @@ class TopicTable:
             if topic.path in {other.path for other in self.extra[:number]}:
                 raise UsageError(f"{topic.path}: is declared twice; name one of the two otherwise")
         self.topics = (*TOPICS, *self.extra)
-        more = {topic.path: topic for topic in self.extra}
-        self.by_field: Mapping[str, Topic] = BY_FIELD | more if more else BY_FIELD
-        self.by_path: Mapping[str, Topic] = BY_PATH | more if more else BY_PATH
+        self.by_field: Mapping[str, Topic] = BY_FIELD | self._extra_by_path
+        self.by_path: Mapping[str, Topic] = BY_PATH | self._extra_by_path
 
     def with_messages(self, tick: Tick, stamp_ns: int, new: Mapping[str, Any]) -> Tick:
         """The tick of a later stamp, with new messages by field."""
@@ -134,7 +133,8 @@ def _refuse_unfit(topic: Topic) -> None:
     if topic.source not in SOURCES or topic.made_by is not None:
         able = ", ".join(f"Source.{source.name}" for source in SOURCES)
         raise UsageError(f"{path}: its source is {topic.source.name}; an extra topic is of {able}")
-    if not _is_recordable(kind):
+    is_message = isinstance(kind, type) and issubclass(kind, Message) and is_dataclass(kind)
+    if not is_message or issubclass(kind, Frame):  # whose encodings belong to its channel
         name = getattr(kind, "__name__", kind)
         raise UsageError(f"{path}: its type {name} is no dataclass that derives from Message, or it is Frame")
     try:
@@ -155,16 +155,10 @@ def _refuse_unfit(topic: Topic) -> None:
         raise UsageError(f"{path}: {kind.__name__} can not be recorded: {error}") from error
 
 
-def _is_recordable(kind: Any) -> bool:
-    is_message = isinstance(kind, type) and issubclass(kind, Message) and is_dataclass(kind)
-    return is_message and not issubclass(kind, Frame)  # whose encodings belong to its channel
-
-
 def declaration(topic: Topic) -> str:
     """The declaration of an extra topic as JSON: source, tolerances, and all fields of its message type."""
     kind: Any = topic.type
-    defaults = {each.name: made for each in fields(kind) if (made := _default_as_json(each)) is not MISSING}
-    stated = [_field_as_json(each, defaults.get(each.name, MISSING)) for each in message_fields(kind)]
+    stated = [_field_as_json(*pair) for pair in zip(message_fields(kind), fields(kind), strict=True)]
     return json.dumps(
         {
             "type": kind.__name__,
@@ -177,16 +171,16 @@ def declaration(topic: Topic) -> str:
     )
 
 
-def _field_as_json(each: MessageField, default: Any) -> dict[str, Any]:
-    stated: dict[str, Any] = {"name": each.name, "kind": getattr(each.kind, "__name__", each.kind)}
-    stated["meaning"] = each.meaning
+def _field_as_json(each: MessageField, of_type: Any) -> dict[str, Any]:
+    kind = getattr(each.kind, "__name__", each.kind)
+    stated: dict[str, Any] = {"name": each.name, "kind": kind, "meaning": each.meaning}
     if each.dtype is not None and each.shape is not None:
         stated |= {"dtype": each.dtype.name, "shape": list(each.shape.lengths)}
     if not each.finite:
         stated["finite"] = False
     if each.optional:
         stated["optional"] = True
-    if default is not MISSING:
+    if (default := _default_as_json(of_type)) is not MISSING:
         stated["default"] = default
     return stated
 

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from flowrec.core.clocks import read_clocks
+from flowrec.core.clocks.clock_monitor import read_clocks
 from flowrec.core.version import NUMERICS_VERSION, __version__
 
 PACKAGES = (
@@ -59,24 +59,21 @@ def provenance(anonymous: bool = False) -> dict[str, str]:
 
 def _code(anonymous: bool) -> dict[str, str]:
     """The commit and the local changes: from git in a checkout, else from the build of the wheel."""
-    commit = _git(PACKAGE, "rev-parse", "HEAD")
+    commit = _git("rev-parse", "HEAD")
     # Only a checkout of flowrec itself counts, not a repository that contains the virtual environment.
-    if not (commit and _git(PACKAGE, "ls-files", "--error-unmatch", "__init__.py")):
-        return _build_facts(PACKAGE / "_build.json")
-    facts = {"git_commit": commit, "git_changed": str(bool(_git(PACKAGE, "status", "--porcelain", "--", ".")))}
-    diff = "" if anonymous else _git(PACKAGE, "diff", "HEAD", "--", ".")
+    if not (commit and _git("ls-files", "--error-unmatch", "__init__.py")):
+        # What hatch_build.py wrote into the wheel, if it was built from a checkout.
+        try:
+            built = json.loads((PACKAGE / "_build.json").read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        return {key: str(value) for key, value in built.items()}
+    facts = {"git_commit": commit, "git_changed": str(bool(_git("status", "--porcelain", "--", ".")))}
+    diff = "" if anonymous else _git("diff", "HEAD", "--", ".")
     if diff:
         cut = f"\n... cut at {_DIFF_LIMIT} characters" if len(diff) > _DIFF_LIMIT else ""
         facts["git_diff"] = diff[:_DIFF_LIMIT] + cut
     return facts
-
-
-def _build_facts(file: Path) -> dict[str, str]:
-    """Facts that hatch_build.py wrote into the wheel; empty if it was not built from a checkout."""
-    try:
-        return {key: str(value) for key, value in json.loads(file.read_text(encoding="utf-8")).items()}
-    except FileNotFoundError:
-        return {}
 
 
 def user_name() -> str:
@@ -87,11 +84,11 @@ def user_name() -> str:
         return "unknown"
 
 
-def _git(folder: Path, *words: str) -> str:
-    """Output of git, '' if there is no git or no repository."""
+def _git(*words: str) -> str:
+    """Output of git in the folder of the package, '' if there is no git or no repository."""
     try:
         done = subprocess.run(  # noqa: S603
-            ["git", "-C", str(folder), *words],  # noqa: S607
+            ["git", "-C", str(PACKAGE), *words],  # noqa: S607
             capture_output=True,
             text=True,
             timeout=10,

@@ -11,8 +11,10 @@ M_PER_UM = 1e-6
 UM_PER_M = 1e6
 PA_S_PER_MPA_S = 1e-3
 # Units on the command line.
-_S_PER = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-_MB_PER = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6}
+_PER = {
+    "s": {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
+    "mb": {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6},
+}
 _AMOUNT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
 
 
@@ -38,14 +40,13 @@ def amounts(text: str) -> dict[str, list[float]]:
     ------
     ValueError : a part of the text is neither.
     """
-    found: dict[str, list[float]] = {"s": [], "mb": []}
+    found: dict[str, list[float]] = {kind: [] for kind in _PER}
     for part in text.split(","):
         match = _AMOUNT.fullmatch(part)
         unit = match[2].lower() if match is not None else ""
-        if match is not None and unit in _S_PER:
-            found["s"].append(float(match[1]) * _S_PER[unit])
-        elif match is not None and unit in _MB_PER:
-            found["mb"].append(float(match[1]) * _MB_PER[unit])
+        kind = next((kind for kind, units in _PER.items() if unit in units), None)
+        if match is not None and kind is not None:
+            found[kind].append(float(match[1]) * _PER[kind][unit])
         else:
             raise ValueError(f"{part.strip()!r} is neither a time (ms, s, min, h) nor a size (kB, MB, GB, TB)")
     return found

@@ -125,24 +125,23 @@ def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int], bits:
     since_ns = 0
     for arrived in inputs:
         frame = arrived.frame
-        if frame is None:  # the camera is absent
-            yield replace(arrived, applied=replace(arrived.applied, image_since_ns=since_ns)) if last else arrived
-            continue
-        if frame.image.shape != image_shape:
-            height, width = frame.image.shape
-            raise RigError(
-                f"frame {frame.index}: an image of {width} x {height} pixels, where camera.width_px x camera.height_px "
-                f"= {image_shape[1]} x {image_shape[0]} is expected; set them, or the camera's region of interest"
-            )
-        if frame.bits != bits:
-            raise RigError(
-                f"frame {frame.index}: an image of {frame.bits} bit, where camera.bits = {bits} is expected; set it, "
-                "or the camera's pixel format"
-            )
-        if last is None or not _same(last, frame):
-            since_ns = arrived.stamp_ns
-        last = frame
-        yield replace(arrived, applied=replace(arrived.applied, image_since_ns=since_ns))
+        if frame is not None:  # else the camera is absent
+            if frame.image.shape != image_shape:
+                height, width = frame.image.shape
+                raise RigError(
+                    f"frame {frame.index}: an image of {width} x {height} pixels, where camera.width_px x "
+                    f"camera.height_px = {image_shape[1]} x {image_shape[0]} is expected; set them, or the camera's "
+                    "region of interest"
+                )
+            if frame.bits != bits:
+                raise RigError(
+                    f"frame {frame.index}: an image of {frame.bits} bit, where camera.bits = {bits} is expected; set "
+                    "it, or the camera's pixel format"
+                )
+            if last is None or not _same(last, frame):
+                since_ns = arrived.stamp_ns
+            last = frame
+        yield replace(arrived, applied=replace(arrived.applied, image_since_ns=since_ns)) if last else arrived
 
 
 def _same(one: Frame, other: Frame) -> bool:

@@ -83,16 +83,17 @@ def keyboard_of(control: RunControl) -> Iterator[tuple[Keyboard, Callable[[], No
     if descriptor is None:
         yield None
         return
-    keyboard = Keyboard(control)
-    with _Terminal(descriptor) as terminal:
-        over = threading.Event()
-        reader = threading.Thread(target=_read, args=(terminal, keyboard.take, over), name="keys", daemon=True)
+    keyboard, terminal, over = Keyboard(control), _Terminal(descriptor), threading.Event()
+    reader = threading.Thread(target=_read, args=(terminal, keyboard.take, over), name="keys", daemon=True)
+    try:
+        terminal.take_over()
         reader.start()
-        try:
-            yield keyboard, terminal.leave
-        finally:
-            over.set()
+        yield keyboard, terminal.leave
+    finally:
+        over.set()
+        if reader.ident is not None:
             reader.join(2 * _POLL_S)
+        terminal.leave()
 
 
 def _terminal() -> int | None:
@@ -112,18 +113,14 @@ class _Terminal:
         self._lock = threading.RLock()
         self._left = False
 
-    def __enter__(self) -> _Terminal:
-        self.take_over()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.leave()
-
     def leave(self) -> None:
         """Restore the terminal for good: at the end of the run, or at Ctrl-Z, which ends it."""
         with self._lock:
             self._left = True
-            self._restore()
+            # TCSANOW, because TCSADRAIN waits for ever on a frozen terminal.
+            if self._found is not None and self._in_foreground():
+                with contextlib.suppress(termios.error), _sigttou_blocked():
+                    termios.tcsetattr(self.descriptor, termios.TCSANOW, self._found)
 
     def take_over(self) -> bool:
         """Make it hand over keys; False in the background. Called before every read: a shell may have restored it."""
@@ -136,12 +133,6 @@ class _Terminal:
                     self._found = now
                     tty.setcbreak(self.descriptor, termios.TCSANOW)
             return True
-
-    def _restore(self) -> None:
-        # TCSANOW, because TCSADRAIN waits for ever on a frozen terminal.
-        if self._found is not None and self._in_foreground():
-            with contextlib.suppress(termios.error), _sigttou_blocked():
-                termios.tcsetattr(self.descriptor, termios.TCSANOW, self._found)
 
     def _in_foreground(self) -> bool:
         """True if this process is in the foreground; in the background, reading the terminal would stop the run."""

@@ -23,52 +23,59 @@ class OperatorCommand:
     words : what the key does, in the terminal's line of keys and on the console's button.
     meaning : what it does to the robot and the run.
     give : takes the control, a text (only a note has one) and how the command was given: a key, or `console`. False,
-        and nothing is done, while too many events wait.
+        and nothing is done, while too many events wait; None of a command that need not wait.
     """
 
     name: str
     key: str
     words: str
     meaning: str
-    give: Callable[[RunControl, str, str], bool]
-
-
-def _stop(control: RunControl, _text: str, by: str) -> bool:
-    control.stop(f"stopped by the operator ({by})")
-    return True
-
-
-def _mark(control: RunControl, _text: str, _by: str) -> bool:
-    return control.mark()
+    give: Callable[[RunControl, str, str], bool | None]
 
 
 def _note(control: RunControl, text: str, _by: str) -> bool:
     return not text.strip() or control.request(Action.NOTE, text.strip()[:LONGEST_NOTE])
 
 
-def _hold(control: RunControl, _text: str, _by: str) -> bool:
-    control.toggle_hold()
-    return True
-
-
-def _end(control: RunControl, _text: str, by: str) -> bool:
-    return control.request(Action.END, f"ended by the operator ({by})")
-
-
-def _zero(control: RunControl, _text: str, by: str) -> bool:
-    control.stop(f"operator: zero field ({by})", zero=True)
-    return True
-
-
 COMMANDS = {
     row.name: row
     for row in (
-        OperatorCommand("stop", "q", "stop", "The field ramps down, then the run ends.", _stop),
-        OperatorCommand("mark", "m", "mark", "A numbered mark at this moment of the recording.", _mark),
+        OperatorCommand(
+            "stop",
+            "q",
+            "stop",
+            "The field ramps down, then the run ends.",
+            lambda control, _text, by: control.stop(f"stopped by the operator ({by})"),
+        ),
+        OperatorCommand(
+            "mark",
+            "m",
+            "mark",
+            "A numbered mark at this moment of the recording.",
+            lambda control, _text, _by: control.mark(),
+        ),
         OperatorCommand(NOTE, "n", "note", "A text at this moment of the recording.", _note),
-        OperatorCommand("hold", " ", "hold, go on", "The robot is held in its place, or goes on.", _hold),
-        OperatorCommand("end", "e", "end observing", "The observation ends; its refinement begins.", _end),
-        OperatorCommand("zero", "!", "zero field at once", "The field is off on the next tick; the run ends.", _zero),
+        OperatorCommand(
+            "hold",
+            " ",
+            "hold, go on",
+            "The robot is held in its place, or goes on.",
+            lambda control, _text, _by: control.toggle_hold(),
+        ),
+        OperatorCommand(
+            "end",
+            "e",
+            "end observing",
+            "The observation ends; its refinement begins.",
+            lambda control, _text, by: control.request(Action.END, f"ended by the operator ({by})"),
+        ),
+        OperatorCommand(
+            "zero",
+            "!",
+            "zero field at once",
+            "The field is off on the next tick; the run ends.",
+            lambda control, _text, by: control.stop(f"operator: zero field ({by})", zero=True),
+        ),
     )
 }
 BY_KEY = {row.key: row for row in COMMANDS.values()}

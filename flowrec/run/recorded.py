@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from flowrec.core import Currents, Message, Role, Tick, TopicTable
+from flowrec.core import Currents, Role, Tick, TopicTable
 from flowrec.stages import ARRIVING, FROM_IMAGE, Inputs
 from flowrec.store import SessionReader
 
@@ -65,16 +65,13 @@ class RecordedRig:
                 from_image = {name: getattr(tick, name) for name in FROM_IMAGE}
                 new |= {name: known for name, known in from_image.items() if known is not getattr(before, name)}
             if tick.extra is not before.extra:
-                new["extra"] = self._new_extra(before, tick)
+                new["extra"] = {
+                    path: self._topics.as_declared(message, path)
+                    for path, message in tick.extra.items()
+                    if path in self._extra and message is not before.extra.get(path)
+                }
             yield Inputs(tick.stamp_ns, **({"frame": None} | new))
             before = tick
-
-    def _new_extra(self, before: Tick, tick: Tick) -> dict[str, Message]:
-        return {
-            path: self._topics.as_declared(message, path)
-            for path, message in tick.extra.items()
-            if path in self._extra and message is not before.extra.get(path)
-        }
 
     def apply(self, currents: Currents) -> None:
         """Do nothing: there are no coils."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 import numpy as np
 
@@ -133,10 +133,10 @@ def before_after(done: ReplayPair) -> list[Row]:
         add("residual_um_s", lambda tick: _residual_um_s(tick.field, observations))
     if was.route is not None or now.route is not None:
         add("planner", lambda tick: _planner(tick.route))
-        add("route_length_um", lambda tick: _length_um(tick.route))
+        add("route_length_um", lambda tick: length_um(tick.route) if _leads(tick.route) else None)
         limit_um_s = done.config.plan.speed_share * done.config.robot.speed_limit_um_s
-        if now.field is not None:
-            add("travel_time_on_replayed_map_s", lambda tick: _travel_time_s(tick.route, now.field, limit_um_s))
+        if (field := now.field) is not None:
+            add("travel_time_on_replayed_map_s", lambda tick: _travel_time_s(tick.route, field, limit_um_s))
     controllers = done.session.config.control.method, done.config.control.method
     if controllers[0] != controllers[1]:
         rows.append(("controller", *controllers))
@@ -161,13 +161,13 @@ def _planner(route: Route | None) -> str:
     return "none" if route is None else route.method if route.reachable else f"{route.method}: unreachable"
 
 
-def _length_um(route: Route | None) -> float | None:
-    return length_um(route) if route is not None and route.reachable else None
+def _leads(route: Route | None) -> TypeGuard[Route]:
+    return route is not None and route.reachable
 
 
-def _travel_time_s(route: Route | None, flow: FlowField | None, limit_um_s: float) -> float | None:
-    """None where there is no map or route, or it can not be followed."""
-    if flow is None or route is None or not route.reachable:
+def _travel_time_s(route: Route | None, flow: FlowField, limit_um_s: float) -> float | None:
+    """None where there is no route, or it can not be followed."""
+    if not _leads(route):
         return None
     arrival_s, feasible = travel_time(flow, route.waypoints_um, limit_um_s)
     return float(arrival_s[-1]) if feasible else None

@@ -26,7 +26,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from types import FrameType
 
 from flowrec.core import Priority, realtime_priority, said_within, status_of, stopped_by
 from flowrec.run.control import RunControl
@@ -94,8 +93,11 @@ class Signals:
             stack.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(-1))
             signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
             for number in wanted:
-                stack.callback(signal.signal, number, signal.signal(number, _nothing))
-            stack.callback(signal.signal, signal.SIGALRM, signal.signal(signal.SIGALRM, self._interrupt))
+                stack.callback(
+                    signal.signal, number, signal.signal(number, lambda *_: None)
+                )  # its number is in the pipe
+            interrupt = signal.signal(signal.SIGALRM, lambda *_: self._control.interrupt())
+            stack.callback(signal.signal, signal.SIGALRM, interrupt)
             thread = threading.Thread(target=self._listen, args=(reading,), name="signals", daemon=True)
             thread.start()
             try:
@@ -111,9 +113,6 @@ class Signals:
             for number in os.read(pipe, 64):
                 if number in _ENDING:
                     self._handle(number)
-
-    def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
-        self._control.interrupt()
 
     # ---- the thread
 
@@ -177,7 +176,3 @@ class Signals:
         self._leave_terminal()
         said_within(_PRINT_S, lambda: print(f"flowrec: {'; '.join(filter(None, lines))}", file=sys.stderr))
         os._exit(1 if watchdog is not None or self._by is None else status_of(self._by))
-
-
-def _nothing(_number: int, _frame: FrameType | None) -> None:
-    """Do nothing: the number of the signal is in the pipe."""

@@ -7,11 +7,10 @@ message gets the stamp of that tick.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any, Self
 
-from flowrec.core import Message
 from flowrec.stages import ExtraRow, Inputs
 
 _JOIN_S = 1.0
@@ -29,7 +28,7 @@ class Streams:
     def __init__(self, rows: Iterable[ExtraRow], tell: Callable[[str], None]) -> None:
         self._rows = [row for row in rows if callable(getattr(row.settings, "stream", None))]
         self._tell = tell
-        self._latest: dict[str, Message] = {}
+        self._latest: dict[str, Any] = {}  # messages by path
         self._changed = threading.Lock()
         self._closing = threading.Event()
         self._threads = [
@@ -50,14 +49,13 @@ class Streams:
     def join(self, arriving: Iterator[Inputs]) -> Iterator[Inputs]:
         """The inputs with the messages that have come since the last ones."""
         for inputs in arriving:
-            new = self._take_latest(inputs.stamp_ns) if self._latest else {}
-            yield replace(inputs, extra={**inputs.extra, **new}) if new else inputs
-
-    def _take_latest(self, stamp_ns: int) -> Mapping[str, Message]:
-        with self._changed:
-            taken, self._latest = self._latest, {}
-        made: dict[str, Any] = taken
-        return {path: replace(message, stamp_ns=stamp_ns) for path, message in made.items()}
+            if not self._latest:
+                yield inputs
+                continue
+            with self._changed:
+                taken, self._latest = self._latest, {}
+            new = {path: replace(message, stamp_ns=inputs.stamp_ns) for path, message in taken.items()}
+            yield replace(inputs, extra={**inputs.extra, **new})
 
     def _read(self, row: ExtraRow) -> None:
         path, kind = row.topic.path, row.topic.type

@@ -17,9 +17,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 from flowrec.core import Currents, Priority, RigError, realtime_priority
+from flowrec.rigs import Rig
 
 ZERO_PATIENCE_S = 2.0  # time for zero() to succeed, with all its repetitions; then the run fails
 _RETRY_S = 0.02
@@ -27,20 +27,13 @@ _POLL_S = 0.002
 _IDLE_S = 0.5  # between checks without a timer
 
 
-class CoilOutput(Protocol):
-    """The part of rigs.rig.Rig that the watchdog needs."""
-
-    def apply(self, currents: Currents) -> None: ...
-
-    def zero(self) -> None: ...
-
-
 class Watchdog:
     """Between the loop and the coils.
 
     Parameters
     ----------
-    rig : its `zero` is called in the watchdog's thread only, where no signal handler of Python runs.
+    rig : of it only `apply` and `zero` are used; `zero` in the watchdog's thread only, where no signal handler of
+        Python runs.
     timeout_s : longest time without the end of a tick while a field is on; None: no timer, the field is switched off on
         request only.
     tripped : called with the reason when the field is switched off; in any thread, must return at once.
@@ -57,7 +50,7 @@ class Watchdog:
 
     def __init__(
         self,
-        rig: CoilOutput,
+        rig: Rig,
         timeout_s: float | None = None,
         tripped: Callable[[str], None] = lambda _reason: None,
         alarm: Callable[[str], None] = lambda _text: None,

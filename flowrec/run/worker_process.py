@@ -10,23 +10,18 @@ import contextlib
 import os
 import pickle
 import queue
-import signal
-import subprocess
 import sys
 import tempfile
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, BinaryIO
 
-from flowrec.core import WORKER_FIELDS, FlowrecError, Tick, child_command, child_environment
+from flowrec.core import WORKER_FIELDS, ChildProcess, FlowrecError, Parent, Tick
 from flowrec.run.workers import Result, Results, order_of, work
 from flowrec.stages import Pipeline, warm_up
 
 _NAME = "the process that solves and plans"
-_LOG_BYTES = 65_536  # the last part of what the process printed
 _JOIN_S = 1.0
 
 
@@ -38,28 +33,18 @@ class ProcessWorker:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._fills: deque[str] = deque()  # fields of Tick that the results to come go to
-        # The threads share only these queues, which lock themselves, and `_printed`, which the receiver reads after the
-        # thread that fills it has ended.
+        # The threads share only these queues, which lock themselves.
         self._results: queue.SimpleQueue[Result | Exception] = queue.SimpleQueue()
         self._orders: queue.SimpleQueue[Pipeline | Tick | None] = queue.SimpleQueue()
-        self._printed = b""
         self._orders.put(pipeline)
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - our own module
-                child_command("flowrec.run.worker_process"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,  # Ctrl-C and a closed terminal end the run, and then the run ends this
-                env=child_environment(),
-            )
+            self._child = ChildProcess("flowrec.run.worker_process")
         except OSError as error:
             raise FlowrecError(
                 f"{_NAME} does not start ({error.strerror or error}); free memory, then record again"
             ) from error
         self._threads = [
-            threading.Thread(target=target, name="work process", daemon=True)
-            for target in (self._collect_output, self._send, self._receive)
+            threading.Thread(target=target, name="work process", daemon=True) for target in (self._send, self._receive)
         ]
         for thread in self._threads:
             thread.start()
@@ -77,89 +62,63 @@ class ProcessWorker:
         Raises what the work has raised; FlowrecError if the process has ended, was stopped by a signal, or its answer
         can not be read.
         """
-        result = self._result() if self._fills else None
-        return {} if result is None else {self._fills.popleft(): replace(result, stamp_ns=stamp_ns)}
-
-    def _result(self) -> Result | None:
+        if not self._fills:
+            return {}
         try:
             result = self._results.get_nowait()
         except queue.Empty:
             if self._is_stopped():
                 raise FlowrecError(
-                    f"{_NAME} (process {self._process.pid}) was stopped by a signal, and the mission waits for it; "
-                    "find out who sent it, then record again"
+                    f"{_NAME} (process {self._child.process.pid}) was stopped by a signal, and the mission waits for "
+                    "it; find out who sent it, then record again"
                 ) from None
-            return None
+            return {}
         if isinstance(result, Exception):
             raise result
-        return result
+        return {self._fills.popleft(): replace(result, stamp_ns=stamp_ns)}
 
     def close(self) -> None:
         """End the process at once, its threads and pipes."""
-        self._process.kill()
-        self._process.wait()
+        self._child.process.kill()
         self._orders.put(None)
         for thread in self._threads:
             thread.join(_JOIN_S)
-        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
-            assert pipe is not None
-            with contextlib.suppress(OSError):  # the unread part of an order
-                pipe.close()
+        self._child.close()
 
     def _is_stopped(self) -> bool:
         if sys.platform != "win32":  # where no signal stops a process
             with contextlib.suppress(ChildProcessError):  # it has ended; the receiver reports that
-                return os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+                return os.waitid(os.P_PID, self._child.process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
         return False
 
-    def _collect_output(self) -> None:
-        pipe = self._process.stderr
-        assert pipe is not None
-        while output := os.read(pipe.fileno(), _LOG_BYTES):
-            self._printed = (self._printed + output)[-_LOG_BYTES:]
-
     def _send(self) -> None:
-        pipe = self._process.stdin
-        assert pipe is not None
         try:
             while (order := self._orders.get()) is not None:
-                pipe.write(pickle.dumps(order, pickle.HIGHEST_PROTOCOL))
-                pipe.flush()
+                self._child.send(order)
         except OSError:
             pass  # it has ended; the receiver reports that
         except Exception as error:  # noqa: BLE001  the mission must not wait for an order that was never sent
             self._results.put(FlowrecError(f"{_NAME} can not be sent an order ({_describe(error)})"))
 
     def _receive(self) -> None:
-        pipe = self._process.stdout
-        assert pipe is not None
         try:
             while True:
-                self._results.put(pickle.load(pipe))  # noqa: S301 - from our own process
+                self._results.put(self._child.receive())
         except (OSError, EOFError, pickle.UnpicklingError):
-            self._results.put(FlowrecError(f"{_NAME} has ended unasked ({self._cause()}); {self._log()}"))
+            self._results.put(FlowrecError(f"{_NAME} has ended unasked ({self._child.cause()}); {self._log()}"))
         except BaseException as error:  # noqa: BLE001  after any error the mission must not wait for ever
             self._results.put(
                 FlowrecError(f"{_NAME} gave an answer that can not be read ({_describe(error)}); {self._log()}")
             )
 
-    def _cause(self) -> str:
-        try:
-            status = self._process.wait(_JOIN_S)
-        except subprocess.TimeoutExpired:
-            return "its pipe is closed"
-        return f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-
     def _log(self) -> str:
         """Write the log file; the end of an error text that names it."""
-        if self._process.poll() is not None:
-            self._threads[0].join(_JOIN_S)
-        if not self._printed:
+        if not self._child.printed:
             return "it printed nothing; is memory short?"
         try:
             number, name = tempfile.mkstemp(prefix="flowrec-worker-", suffix=".log")
             with os.fdopen(number, "wb") as log:
-                log.write(self._printed)
+                log.write(self._child.printed)
         except OSError as error:
             return f"what it printed can not be kept ({error.strerror or error})"
         return f"see {name} for what it printed"
@@ -183,32 +142,9 @@ def _answer(pipeline: Pipeline, order: Tick) -> bytes:
         return pickle.dumps(FlowrecError(f"{_NAME} failed ({_describe(error)})"), pickle.HIGHEST_PROTOCOL)
 
 
-def _serve(orders: BinaryIO, results: BinaryIO) -> None:
-    """Work until the parent process has ended."""
-    waiting: queue.SimpleQueue[Tick] = queue.SimpleQueue()
-    pipeline: Pipeline = pickle.load(orders)  # noqa: S301 - from our own parent
-    threading.Thread(target=_listen, args=(orders, waiting.put), daemon=True).start()
+if __name__ == "__main__":
+    parent = Parent()
+    given: Pipeline = parent.order()
     warm_up()
     while True:
-        results.write(_answer(pipeline, waiting.get()))
-        results.flush()
-
-
-def _listen(orders: BinaryIO, put: Callable[[Any], None]) -> None:
-    try:
-        while True:
-            put(pickle.load(orders))  # noqa: S301 - from our own parent
-    except (OSError, EOFError):
-        os._exit(0)  # also during an order, because no process reads the result any more
-    except BaseException:  # noqa: BLE001  an order that can not be read
-        traceback.print_exc()
-        os._exit(1)
-
-
-if __name__ == "__main__":
-    private = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints must not get between the results
-    try:
-        _serve(sys.stdin.buffer, private)
-    except (BrokenPipeError, EOFError):
-        os._exit(0)
+        parent.answer(_answer(given, parent.order()))

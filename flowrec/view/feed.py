@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flowrec.core import Frame, Tick, child_command, child_environment
+from flowrec.core import Frame, Tick, start_child
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
@@ -84,14 +84,7 @@ class Feed:
         with tempfile.NamedTemporaryFile(prefix="flowrec-view-", suffix=".log", delete=False) as log:
             self._log = Path(log.name)
             try:
-                self.process = subprocess.Popen(  # noqa: S603 - our own module
-                    child_command(*command),
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE if answers else log,
-                    stderr=log,
-                    start_new_session=True,  # Ctrl-C ends the run, and then the run ends this
-                    env=child_environment(),
-                )
+                self.process = start_child(*command, stdout=subprocess.PIPE if answers else log, stderr=log)
             except OSError:
                 self._log.unlink()
                 raise

@@ -16,8 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from flowrec.bench.harness import Results, Seed, run
-from flowrec.core.clocks import DeviceClock, Fit
-from flowrec.core.clocks.device_clock import envelope
+from flowrec.core.clocks.device_clock import DeviceClock, Fit, envelope
 from flowrec.core.terminal import table
 from flowrec.core.units import NS_PER_S
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.rigs.simulated.true_coils import TrueCoils
+from flowrec.rigs.simulated.world import TrueCoils
 from flowrec.stages.control import Coils
 from tests.rigs.test_simulated import EXACT, command, fly, rig_with
 

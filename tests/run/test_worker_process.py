@@ -123,7 +123,7 @@ def test_orders_are_answered_as_at_home_and_a_process_that_is_killed_is_told_of(
     process.submit(order)
     assert answer(process).same_as(work(pipeline, order))
     assert answer(process).request == 1
-    os.kill(process._process.pid, signal.SIGKILL)
+    os.kill(process._child.process.pid, signal.SIGKILL)
     process.submit(order)
     error = answer(process)
     assert isinstance(error, FlowrecError)
@@ -134,7 +134,7 @@ def test_a_process_that_is_stopped_while_the_mission_waits_for_it_is_told_of(ord
     process = working("sleeps")
     process.submit(order)
     assert process.due(0) == {}
-    os.kill(process._process.pid, signal.SIGSTOP)
+    os.kill(process._child.process.pid, signal.SIGSTOP)
     assert "was stopped by a signal" in str(answer(process))
 
 
@@ -158,8 +158,8 @@ def test_what_the_process_printed_is_in_the_log_that_the_error_names_and_a_clean
 ) -> None:
     process = working("sleeps")
     process.submit(order)
-    until(lambda: b"solving sleeps" in process._printed)
-    os.kill(process._process.pid, signal.SIGKILL)
+    until(lambda: b"solving sleeps" in process._child.printed)
+    os.kill(process._child.process.pid, signal.SIGKILL)
     log = Path(str(answer(process)).split("see ")[1].split(" for")[0])
     assert "solving sleeps" in log.read_text()
     log.unlink()
@@ -192,4 +192,5 @@ def test_a_process_that_is_closed_leaves_no_thread_and_no_open_pipe(order, worki
     process.submit(order)
     process.close()
     until(lambda: set(threading.enumerate()) <= before)
-    assert all(pipe.closed for pipe in (process._process.stdin, process._process.stdout, process._process.stderr))
+    child = process._child.process
+    assert all(pipe.closed for pipe in (child.stdin, child.stdout, child.stderr))

@@ -93,7 +93,7 @@ class TwinWorld(SimulatedRig):
     @property
     def true_field(self) -> FlowField:
         """The flow in which the robot swims."""
-        return self._true_field()
+        return self.true_world().field
 
     def _advance(self, swimmer: Swimmer, until_ns: int) -> np.ndarray:
         time.sleep(max(0.0, seconds(self.began_ns + until_ns + _LATE_NS - time.monotonic_ns())))

@@ -8,20 +8,15 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import os
 import pickle
 import queue
-import signal
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 from dataclasses import replace
-from typing import Any, BinaryIO
+from typing import Any
 
 from flowrec.archive.sweep.tasks import Task, content_of
-from flowrec.core import FlowrecError, SessionError, child_command, child_environment, forget_peak, peak_mb, printable
+from flowrec.core import ChildProcess, FlowrecError, Parent, SessionError, forget_peak, peak_mb, printable
 
 Row = dict[str, Any]
 
@@ -30,7 +25,6 @@ _START_S = 600.0  # a new installation compiles its kernels
 _PERIOD_S = 0.1  # between two looks at the memory
 _JOIN_S = 5.0
 _ATTEMPTS = 2  # a task that has ended its process so often is set aside
-_PRINTED = 4096  # bytes at the end of what the process printed
 
 _of_thread = threading.local()
 
@@ -99,15 +93,7 @@ class _Process:
     def __init__(self) -> None:
         self.lasted_s, self.peak_bytes = 0.0, 0
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
-        self._process = subprocess.Popen(  # noqa: S603 - our own module
-            child_command("flowrec.archive.sweep.replay_process"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._printed,
-            start_new_session=True,  # Ctrl-C ends the sweep, and then the sweep ends this
-            env=child_environment(),
-        )
+        self._child = ChildProcess("flowrec.archive.sweep.replay_process")
         atexit.register(self._end)
         self._receiver = threading.Thread(target=self._receive, name="replay process", daemon=True)
         self._receiver.start()
@@ -116,10 +102,8 @@ class _Process:
     def row(self, task: Task) -> Row:
         """The row of a task; _EndedError if the process has ended before."""
         self.peak_bytes, began_s = 0, time.monotonic()
-        assert self._process.stdin is not None
         with contextlib.suppress(OSError):  # it has ended; the receiver reports that
-            pickle.dump(task, self._process.stdin)
-            self._process.stdin.flush()
+            self._child.send(task)
         try:
             row: Row = self._wait(began_s, task.timeout_s, task.memory_bytes)
         finally:
@@ -139,7 +123,7 @@ class _Process:
                     raise _EndedError(self._cause())
                 return answer
             with contextlib.suppress(psutil.Error):  # it has ended; the receiver reports that
-                self.peak_bytes = max(self.peak_bytes, psutil.Process(self._process.pid).memory_info().rss)
+                self.peak_bytes = max(self.peak_bytes, psutil.Process(self._child.process.pid).memory_info().rss)
             if timeout_s is not None and time.monotonic() - began_s > timeout_s:
                 self._end()
                 raise _LimitError(f"it took longer than {timeout_s:g} s (--timeout), and was ended")
@@ -148,34 +132,22 @@ class _Process:
                 raise _LimitError(f"it needed more than {memory_bytes / 1e9:.3g} GB (--memory), and was ended")
 
     def _receive(self) -> None:
-        assert self._process.stdout is not None
         try:
             while True:
-                self._answers.put(pickle.load(self._process.stdout))  # noqa: S301 - from our own process
+                self._answers.put(self._child.receive())
         except (OSError, EOFError, pickle.UnpicklingError):
             self._answers.put(None)
 
     def _cause(self) -> str:
-        try:
-            status = self._process.wait(_JOIN_S)
-        except subprocess.TimeoutExpired:
-            status = 0
-        self._printed.seek(max(self._printed.seek(0, os.SEEK_END) - _PRINTED, 0))
-        last = self._printed.read().decode(errors="replace").strip().rpartition("\n")[2]
+        how, last = self._child.cause(), self._child.last_line
         self._end()
-        how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
         return f"{how}: {last}" if last else how
 
     def _end(self) -> None:
         atexit.unregister(self._end)
-        self._process.kill()
-        self._process.wait()
+        self._child.process.kill()
         self._receiver.join(_JOIN_S)  # it reads to the end of the pipe
-        self._printed.close()
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            with contextlib.suppress(OSError, ValueError):  # the unread part of a task
-                pipe.close()
+        self._child.close()
 
 
 def _row(task: Task) -> Row:
@@ -225,35 +197,19 @@ def _judgement(task: Task) -> Row:
     return {"verdict": verdict.word, "findings": [finding.text for finding in verdict.findings]}
 
 
-def _serve(tasks: BinaryIO, rows: BinaryIO) -> None:
+def _serve(parent: Parent) -> None:
     """Work until the worker has ended."""
     from flowrec.core import console
     from flowrec.stages import warm_up
     from flowrec.verbs import refly  # noqa: F401 - with all that a replay needs, before the first task
 
     console.quiet = True  # a thousand replays have a thousand lines
-    waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(tasks, waiting), daemon=True).start()
     warm_up()
     answer: Any = _READY
     while True:
-        pickle.dump(answer, rows)
-        rows.flush()
-        answer = _row(waiting.get())
-
-
-def _listen(tasks: BinaryIO, waiting: queue.SimpleQueue[Task]) -> None:
-    try:
-        while True:
-            waiting.put(pickle.load(tasks))  # noqa: S301 - from our own parent
-    except (OSError, EOFError):
-        os._exit(0)  # also during a task, because no process reads its row any more
+        parent.answer(pickle.dumps(answer))
+        answer = _row(parent.order())
 
 
 if __name__ == "__main__":
-    private = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints must not get between the rows
-    try:
-        _serve(sys.stdin.buffer, private)
-    except BrokenPipeError:
-        os._exit(0)
+    _serve(Parent())

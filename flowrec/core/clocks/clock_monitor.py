@@ -14,6 +14,7 @@ from flowrec.core.units import nanoseconds, seconds
 _SET_S = 0.01  # a larger change of the wall clock relative to the monotonic one means that it was set
 _SIMULTANEOUS_NS = 100_000
 _ATTEMPTS = 5
+_EVERY_NS = nanoseconds(1.0)  # between the messages on the session clock
 _COUNTS = 1 << 63  # largest counter that a message can hold
 CRYSTAL_PPM = 500.0  # largest plausible error of a camera's clock
 
@@ -54,12 +55,10 @@ class ClockMonitor:
     Parameters
     ----------
     read : returns monotonic and wall clock, ns.
-    every_s : interval of the messages on the session clock.
     """
 
-    def __init__(self, read: Callable[[], tuple[int, int]] = read_clocks, every_s: float = 1.0) -> None:
+    def __init__(self, read: Callable[[], tuple[int, int]] = read_clocks) -> None:
         self._read = read
-        self._every_ns = nanoseconds(every_s)
         self._offset_ns: int | None = None  # wall - monotonic
         self._first_offset_ns = 0
         self._wall_jumps = 0
@@ -86,7 +85,7 @@ class ClockMonitor:
         last, known = self._last, fit if fit is not None else Fit(0, 0, 0)
         counts = (self._wall_jumps, self._skipped, *_irregularities(known))
         unchanged = last is not None and counts == (last.wall_jumps, last.passed_over, *_irregularities(last))
-        if last is not None and unchanged and stamp_ns < last.stamp_ns + self._every_ns:
+        if last is not None and unchanged and stamp_ns < last.stamp_ns + _EVERY_NS:
             return last
         self._last = Clocks(
             stamp_ns=stamp_ns,

@@ -19,6 +19,17 @@ from dataclasses import dataclass, replace
 
 from flowrec.core.units import NS_PER_S, nanoseconds, seconds
 
+_WINDOW_S = 60.0  # long compared with stalls, short compared with changes of temperature
+_INTERVAL_S = 0.5  # the earliest arrival of each interval is used
+_LEAST_SPAN_S = 5.0  # for a shorter time the skew is zero: it can not be distinguished from jitter
+_FOLLOW_S = 1.0  # time constant with which the stamps follow an improved fit
+SLEW = 0.01  # largest relative change of their rate
+_UNIT_S = 1.0  # over which the unit is measured
+_UNIT_TOLERANCE = 0.2  # relative difference beyond which the measured unit replaces the stated one
+_EARLY_S = 0.05  # a frame that is earlier than this means that the device's clock was set forwards
+_LATE_S = 0.25  # if all frames are later than this, it was set back or stood still
+_BACK_S = 1.0  # a frame that is older than this is a reset, not disorder
+
 Point = tuple[int, int]  # device time, unwrapped, in its own unit; arrival, ns on the session clock
 
 
@@ -83,157 +94,152 @@ class DeviceClock:
 
     unit: float = 1.0  # ns per count, as the manufacturer states
     wrap: int = 1 << 32  # counters of fewer than 64 bits start again at this count
-    window_s: float = 60.0  # long compared with stalls, short compared with changes of temperature
-    interval_s: float = 0.5  # the earliest arrival of each interval is used
-    least_span_s: float = 5.0  # for a shorter time the skew is zero: it can not be distinguished from jitter
-    follow_s: float = 1.0  # time constant with which the stamps follow an improved fit
-    slew: float = 0.01  # largest relative change of their rate
-    unit_s: float = 1.0  # over which the unit is measured
-    unit_tolerance: float = 0.2  # relative difference beyond which the measured unit replaces the stated one
-    early_s: float = 0.05  # a frame that is earlier than this means that the device's clock was set forwards
-    late_s: float = 0.25  # if all frames are later than this, it was set back or stood still
-    back_s: float = 1.0  # a frame that is older than this is a reset, not disorder
 
     def take(self, fit: Fit | None, device: int, arrival_ns: int) -> Fit:
         """The fit after one more frame, with its stamp or the reason why it is to be skipped."""
         if fit is None:
-            return self._restart(Fit(arrival_ns - 1, device, arrival_ns, rate=self.unit), device, arrival_ns, "")
-        x, wrap_offset = self._unwrap(fit, device, arrival_ns)
+            return _restart(Fit(arrival_ns - 1, device, arrival_ns, rate=self.unit), device, arrival_ns, "")
+        x, wrap_offset = _unwrap(fit, device, arrival_ns, self.wrap)
         if x <= fit.last[0]:
-            return self._old(replace(fit, device=device, arrival_ns=arrival_ns), x)
+            return _old(replace(fit, device=device, arrival_ns=arrival_ns), x)
         wraps = fit.wraps + (wrap_offset != fit.wrap_offset)
         if fit.old_frames or fit.flag or wraps != fit.wraps:
             flag = "wrapped" if wraps != fit.wraps else ""
             fit = replace(fit, flag=flag, wrap_offset=wrap_offset, wraps=wraps, old_frames=0)
-        return self._advance(fit, device, (x, arrival_ns))
+        return _advance(fit, device, (x, arrival_ns))
 
-    def _old(self, fit: Fit, x: int) -> Fit:
-        """The fit after a frame that is not newer than the last good one."""
-        if x == fit.last[0]:
-            return replace(fit, flag="duplicate", duplicates=fit.duplicates + 1)
-        if seconds(round((fit.last[0] - x) * fit.rate)) > self.back_s or fit.old_frames == 2:
-            fit = replace(fit, resets=fit.resets + 1, wrap_offset=0)
-            return self._restart(fit, fit.device, fit.arrival_ns, "reset")
-        return replace(fit, flag="out of order", disordered=fit.disordered + 1, old_frames=fit.old_frames + 1)
 
-    def _restart(self, fit: Fit, x: int, arrival_ns: int, flag: str) -> Fit:
-        """A fit to one frame; the rate is retained and the stamps continue."""
-        first = (x, arrival_ns)
-        return replace(
-            fit,
-            stamp_ns=max(fit.stamp_ns + 1, arrival_ns),
-            flag=flag,
-            fitted_ns=arrival_ns,
-            late_ns=0,
-            last=first,
-            support=first,
-            first=first,
-            first_points=() if fit.unit_known else (first,),
-            earliest=first,
-            interval_start=x,
-            minima=(),
-            old_frames=0,
-            late_intervals=0,
+def _old(fit: Fit, x: int) -> Fit:
+    """The fit after a frame that is not newer than the last good one."""
+    if x == fit.last[0]:
+        return replace(fit, flag="duplicate", duplicates=fit.duplicates + 1)
+    if seconds(round((fit.last[0] - x) * fit.rate)) > _BACK_S or fit.old_frames == 2:
+        fit = replace(fit, resets=fit.resets + 1, wrap_offset=0)
+        return _restart(fit, fit.device, fit.arrival_ns, "reset")
+    return replace(fit, flag="out of order", disordered=fit.disordered + 1, old_frames=fit.old_frames + 1)
+
+
+def _restart(fit: Fit, x: int, arrival_ns: int, flag: str) -> Fit:
+    """A fit to one frame; the rate is retained and the stamps continue."""
+    first = (x, arrival_ns)
+    return replace(
+        fit,
+        stamp_ns=max(fit.stamp_ns + 1, arrival_ns),
+        flag=flag,
+        fitted_ns=arrival_ns,
+        late_ns=0,
+        last=first,
+        support=first,
+        first=first,
+        first_points=() if fit.unit_known else (first,),
+        earliest=first,
+        interval_start=x,
+        minima=(),
+        old_frames=0,
+        late_intervals=0,
+    )
+
+
+def _advance(fit: Fit, device: int, point: Point) -> Fit:
+    """The fit after one more good frame."""
+    x, arrival_ns = point
+    fitted_ns = _fitted_ns(fit, x)
+    early_ns = fitted_ns - arrival_ns
+    if not fit.unit_known:
+        early = (
+            (*fit.first_points, point)
+            if _is_over(fit, x, fit.first_points[-1][0], _UNIT_S / 64.0)
+            else fit.first_points
         )
-
-    def _advance(self, fit: Fit, device: int, point: Point) -> Fit:
-        """The fit after one more good frame."""
-        x, arrival_ns = point
-        fitted_ns = _fitted_ns(fit, x)
-        early_ns = fitted_ns - arrival_ns
-        if not fit.unit_known:
-            early = (
-                (*fit.first_points, point)
-                if _is_over(fit, x, fit.first_points[-1][0], self.unit_s / 64.0)
-                else fit.first_points
+        fit = replace(fit, first_points=early, device=device, arrival_ns=arrival_ns)
+        if len(early) > 7 and arrival_ns - early[0][1] >= nanoseconds(_UNIT_S):
+            judged = _with_unit(fit, point)
+            if judged is not None:
+                return judged
+            fit = replace(
+                fit,
+                first_points=(point,),
+                suspected_unit=(early[-1][1] - early[0][1]) / (early[-1][0] - early[0][0]),
             )
-            fit = replace(fit, first_points=early, device=device, arrival_ns=arrival_ns)
-            if len(early) > 7 and arrival_ns - early[0][1] >= nanoseconds(self.unit_s):
-                judged = self._with_unit(fit, point)
-                if judged is not None:
-                    return judged
-                fit = replace(
-                    fit,
-                    first_points=(point,),
-                    suspected_unit=(early[-1][1] - early[0][1]) / (early[-1][0] - early[0][0]),
-                )
-            if early_ns > nanoseconds(self.early_s):
-                # The clock seems to count faster than stated; wait for the measurement.
-                return replace(fit, last=point, stamp_ns=max(fit.stamp_ns + 1, arrival_ns))
-        elif early_ns > nanoseconds(self.early_s):
-            fit = replace(fit, device=device, arrival_ns=arrival_ns, jumps=fit.jumps + 1)
-            return self._restart(fit, x, arrival_ns, "jump")
-        fitted_ns = min(fitted_ns, arrival_ns)
-        fit = replace(
-            fit,
-            stamp_ns=self._next_stamp(fit, x, fitted_ns),
-            device=device,
-            arrival_ns=arrival_ns,
-            fitted_ns=fitted_ns,
-            late_ns=arrival_ns - fitted_ns,
-            last=point,
-            support=point if early_ns > 0 else fit.support,
-            earliest=point if _delay_ns(fit.rate, fit.earliest, point) < 0 else fit.earliest,
-        )
-        return self._next_interval(fit, point) if _is_over(fit, x, fit.interval_start, self.interval_s) else fit
+        if early_ns > nanoseconds(_EARLY_S):
+            # The clock seems to count faster than stated; wait for the measurement.
+            return replace(fit, last=point, stamp_ns=max(fit.stamp_ns + 1, arrival_ns))
+    elif early_ns > nanoseconds(_EARLY_S):
+        fit = replace(fit, device=device, arrival_ns=arrival_ns, jumps=fit.jumps + 1)
+        return _restart(fit, x, arrival_ns, "jump")
+    fitted_ns = min(fitted_ns, arrival_ns)
+    fit = replace(
+        fit,
+        stamp_ns=_next_stamp(fit, x, fitted_ns),
+        device=device,
+        arrival_ns=arrival_ns,
+        fitted_ns=fitted_ns,
+        late_ns=arrival_ns - fitted_ns,
+        last=point,
+        support=point if early_ns > 0 else fit.support,
+        earliest=point if _delay_ns(fit.rate, fit.earliest, point) < 0 else fit.earliest,
+    )
+    return _next_interval(fit, point) if _is_over(fit, x, fit.interval_start, _INTERVAL_S) else fit
 
-    def _next_stamp(self, fit: Fit, x: int, fitted_ns: int) -> int:
-        """The next stamp: at the fitted rate, slightly faster or slower towards the envelope."""
-        step_ns = (x - fit.last[0]) * fit.rate
-        error_ns = fitted_ns - (fit.stamp_ns + step_ns)
-        limit_ns = self.slew * step_ns
-        correction_ns = error_ns * min(step_ns / (self.follow_s * NS_PER_S), 1.0)
-        return fit.stamp_ns + max(round(step_ns + min(max(correction_ns, -limit_ns), limit_ns)), 1)
 
-    def _next_interval(self, fit: Fit, point: Point) -> Fit:
-        """Add the earliest arrival of an interval, drop those that are too old, and fit again."""
-        late_intervals = (
-            fit.late_intervals + 1
-            if fit.earliest[1] - _fitted_ns(fit, fit.earliest[0]) > nanoseconds(self.late_s)
-            else 0
-        )
-        if late_intervals == 4:
-            return self._restart(replace(fit, jumps=fit.jumps + 1), *point, "jump")
-        oldest = point[0] - self.window_s * NS_PER_S / fit.rate
-        minima = tuple(one for one in (*fit.minima, fit.earliest) if one[0] >= oldest)
-        rate, support, known = fit.rate, fit.support, fit.known
-        least_s = min(self.least_span_s, 2.0 * self.interval_s) if fit.unit else self.least_span_s
-        if minima and _is_over(fit, minima[-1][0], minima[0][0], least_s):
-            support, rate = envelope(minima)
-            known = True
-        elif minima:
-            support = min(minima, key=lambda one: _delay_ns(fit.rate, minima[0], one))
-        fit = replace(fit, rate=rate, support=support, known=known, minima=minima, late_intervals=late_intervals)
-        return replace(fit, earliest=point, interval_start=point[0])
+def _next_stamp(fit: Fit, x: int, fitted_ns: int) -> int:
+    """The next stamp: at the fitted rate, slightly faster or slower towards the envelope."""
+    step_ns = (x - fit.last[0]) * fit.rate
+    error_ns = fitted_ns - (fit.stamp_ns + step_ns)
+    limit_ns = SLEW * step_ns
+    correction_ns = error_ns * min(step_ns / (_FOLLOW_S * NS_PER_S), 1.0)
+    return fit.stamp_ns + max(round(step_ns + min(max(correction_ns, -limit_ns), limit_ns)), 1)
 
-    def _with_unit(self, fit: Fit, point: Point) -> Fit | None:
-        """The fit with the unit measured over a second; None: not certain yet.
 
-        A unit that differs from the stated one must be measured in two consecutive seconds: a host that is busy at
-        first and then catches up receives frames at any rate.
-        """
-        half = len(fit.first_points) // 2
-        # The median of rates over half a second each is insensitive to a stall and to frames that arrive in pairs.
-        late, soon = fit.first_points[half:], fit.first_points[: len(fit.first_points) - half]
-        rates = sorted((b[1] - a[1]) / (b[0] - a[0]) for a, b in zip(soon, late, strict=True))
-        rate = max(rates[len(rates) // 2], 1e-12)
-        judged = replace(fit, unit_known=True, first_points=())
-        if abs(math.log(rate / fit.rate)) < math.log(1.0 + self.unit_tolerance):
-            support = min((fit.support, *fit.first_points), key=lambda one: _delay_ns(fit.rate, fit.first, one))
-            return self._advance(replace(judged, support=support), judged.device, point)
-        if fit.suspected_unit and abs(math.log(rate / fit.suspected_unit)) < math.log(1.1):
-            return self._restart(replace(judged, rate=rate, unit=rate), *point, "unit")
-        return None
+def _next_interval(fit: Fit, point: Point) -> Fit:
+    """Add the earliest arrival of an interval, drop those that are too old, and fit again."""
+    late_intervals = (
+        fit.late_intervals + 1 if fit.earliest[1] - _fitted_ns(fit, fit.earliest[0]) > nanoseconds(_LATE_S) else 0
+    )
+    if late_intervals == 4:
+        return _restart(replace(fit, jumps=fit.jumps + 1), *point, "jump")
+    oldest = point[0] - _WINDOW_S * NS_PER_S / fit.rate
+    minima = tuple(one for one in (*fit.minima, fit.earliest) if one[0] >= oldest)
+    rate, support, known = fit.rate, fit.support, fit.known
+    least_s = min(_LEAST_SPAN_S, 2.0 * _INTERVAL_S) if fit.unit else _LEAST_SPAN_S
+    if minima and _is_over(fit, minima[-1][0], minima[0][0], least_s):
+        support, rate = envelope(minima)
+        known = True
+    elif minima:
+        support = min(minima, key=lambda one: _delay_ns(fit.rate, minima[0], one))
+    fit = replace(fit, rate=rate, support=support, known=known, minima=minima, late_intervals=late_intervals)
+    return replace(fit, earliest=point, interval_start=point[0])
 
-    def _unwrap(self, fit: Fit, device: int, arrival_ns: int) -> tuple[int, int]:
-        """Device time with the counts of wrap-arounds added, and those counts."""
-        x = device + fit.wrap_offset
-        if not 0 <= device < self.wrap or fit.last[0] - x < self.wrap // 2:
-            return x, fit.wrap_offset
-        expected = fit.last[0] + (arrival_ns - fit.last[1]) / fit.rate
-        again = x + self.wrap * round((expected - x) / self.wrap)
-        near = abs(again - expected) * fit.rate < self.late_s * NS_PER_S and again > fit.last[0]
-        return (again, again - device) if near else (x, fit.wrap_offset)
+
+def _with_unit(fit: Fit, point: Point) -> Fit | None:
+    """The fit with the unit measured over a second; None: not certain yet.
+
+    A unit that differs from the stated one must be measured in two consecutive seconds: a host that is busy at
+    first and then catches up receives frames at any rate.
+    """
+    half = len(fit.first_points) // 2
+    # The median of rates over half a second each is insensitive to a stall and to frames that arrive in pairs.
+    late, soon = fit.first_points[half:], fit.first_points[: len(fit.first_points) - half]
+    rates = sorted((b[1] - a[1]) / (b[0] - a[0]) for a, b in zip(soon, late, strict=True))
+    rate = max(rates[len(rates) // 2], 1e-12)
+    judged = replace(fit, unit_known=True, first_points=())
+    if abs(math.log(rate / fit.rate)) < math.log(1.0 + _UNIT_TOLERANCE):
+        support = min((fit.support, *fit.first_points), key=lambda one: _delay_ns(fit.rate, fit.first, one))
+        return _advance(replace(judged, support=support), judged.device, point)
+    if fit.suspected_unit and abs(math.log(rate / fit.suspected_unit)) < math.log(1.1):
+        return _restart(replace(judged, rate=rate, unit=rate), *point, "unit")
+    return None
+
+
+def _unwrap(fit: Fit, device: int, arrival_ns: int, wrap: int) -> tuple[int, int]:
+    """Device time with the counts of wrap-arounds added, and those counts."""
+    x = device + fit.wrap_offset
+    if not 0 <= device < wrap or fit.last[0] - x < wrap // 2:
+        return x, fit.wrap_offset
+    expected = fit.last[0] + (arrival_ns - fit.last[1]) / fit.rate
+    again = x + wrap * round((expected - x) / wrap)
+    near = abs(again - expected) * fit.rate < _LATE_S * NS_PER_S and again > fit.last[0]
+    return (again, again - device) if near else (x, fit.wrap_offset)
 
 
 def envelope(points: tuple[Point, ...]) -> tuple[Point, float]:

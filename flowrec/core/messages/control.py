@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
-
-from flowrec.core.declarations import Matrix, Message, NanFloat, PerCoil, Shape, Vector, Vector2
+from flowrec.core.declarations import NOT_STATED, Matrix, Message, NanFloat, PerCoil, Shape, Vector, Vector2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +47,7 @@ class Mission(Message):
         Shape("n"),
         "(2,) while the goal was set during the run and no route leads to it yet: the goal before, to which the "
         "present route leads; (0,) otherwise",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     goal_set_ns: Annotated[
         int | None, "stamp at which the operator set the latest goal; None: it is the configured one"
     ] = None
@@ -96,7 +94,7 @@ class AxesCheck(Message):
     gain_std: Annotated[float, "one standard deviation of each of its elements"] = 0.0
     against_um_s: Annotated[
         Vector, Shape("m"), "(2,) velocity that, by the last round, holds the robot against the flow; (0,): not known"
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     verdict: Annotated[str, "enums.AxesVerdict; '' while the check is under way"] = ""
     text: Annotated[str, "the verdict in a sentence, with what to do"] = ""
 
@@ -131,9 +129,7 @@ class Currents(Message):
     saturated: Annotated[bool, "the coils can not generate the full amplitude"]
     plane_rad: Annotated[float, "heading of the plane of rotation; it turns towards heading_rad or its opposite"] = 0.0
     limit_hz: Annotated[float, "step-out frequency at this amplitude; the field's direction never turns faster"] = 0.0
-    voltages_v: Annotated[Vector, Shape("n"), "inputs of the amplifiers, one a coil; (0,) in older files"] = field(
-        default_factory=lambda: np.zeros(0)
-    )
+    voltages_v: Annotated[Vector, Shape("n"), "inputs of the amplifiers, one a coil; (0,) in older files"] = NOT_STATED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.declarations import Matrix, Message, NanFloat, Shape, Vector, Vector2
+from flowrec.core.declarations import NOT_STATED, Matrix, Message, NanFloat, Shape, Vector, Vector2, array_fields
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,16 +30,16 @@ class Estimate(Message):
         Vector,
         Shape("n"),
         "(3,) gradient of the flow at the robot: dvx/dx, dvx/dy, dvy/dx; dvy/dy = -dvx/dx. (0,): not known",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     surprise: Annotated[
         Vector, Shape("m"), "(2,) sliding mean of the innovations, in standard deviations; (0,): not known"
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     um_per_rev: Annotated[float | None, "of the robot; None: the nominal one is used"] = None
     rolled_um_s: Annotated[
         Vector,
         Shape("o"),
         "(2,) the robot's own motion through the fluid, averaged over time as `flow_um_s` is; (0,): not known",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +65,7 @@ class Health(Message):
         "Motion per revolution, see estimation/step_out.py. (4,) exponential sums: um rolled along the heading, um "
         "expected from the revolutions, um by which the map's flow carried the robot, s. (0,): none yet, or not "
         "recorded.",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     limit_hz: Annotated[float | None, "limit of the field's frequency because of step-out; None: the robot's own"] = (
         None
     )
@@ -75,7 +75,7 @@ class Health(Message):
         Shape("o"),
         "(2,) um/s rolled and um/s expected from the revolutions, just before the limit was lowered; (0,): no limit to "
         "test",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,26 +101,16 @@ class Observations(Message):
 
     def only(self, which: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some of the observations, chosen by an index of arrays."""
-        return Observations(
-            self.stamp_ns,
-            self.position_um[which],
-            self.flow_um_s[which],
-            self.std_um_s[which],
-            None if self.rolled_um_s is None else self.rolled_um_s[which],
-            None if self.time_s is None else self.time_s[which],
-            self.radius_um,
-        )
+        stated = {name: array for name, array in self._arrays().items() if array is not None}
+        return replace(self, **{name: array[which] for name, array in stated.items()})
 
     def followed_by(self, more: Observations) -> Observations:
         """These observations, then more; the stamp is that of the later ones. What one does not state, both do not."""
-        rolled = (self.rolled_um_s, more.rolled_um_s)
-        time = (self.time_s, more.time_s)
-        return Observations(
-            more.stamp_ns,
-            np.concatenate((self.position_um, more.position_um)),
-            np.concatenate((self.flow_um_s, more.flow_um_s)),
-            np.concatenate((self.std_um_s, more.std_um_s)),
-            None if rolled[0] is None or rolled[1] is None else np.concatenate((rolled[0], rolled[1])),
-            None if time[0] is None or time[1] is None else np.concatenate((time[0], time[1])),
-            more.radius_um if self.radius_um == more.radius_um else None,
-        )
+        pairs = {name: (array, more._arrays()[name]) for name, array in self._arrays().items()}
+        joined: dict[str, Any] = {
+            name: None if any(each is None for each in pair) else np.concatenate(pair) for name, pair in pairs.items()
+        }
+        return replace(more, radius_um=more.radius_um if self.radius_um == more.radius_um else None, **joined)
+
+    def _arrays(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name, _ in array_fields(Observations)}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from flowrec.core.declarations import Image, Message, NanFloat, PerCoil, Shape, Vector, Vector2
+from flowrec.core.declarations import NOT_STATED, Image, Message, NanFloat, PerCoil, Shape, Vector, Vector2
 from flowrec.core.errors import RigError
 
 PIXEL_BITS = (8, 10, 12, 14, 16)
@@ -103,7 +103,7 @@ class OperatorEvent(Message):
     stamp_ns: int
     action: Annotated[str, "enums.Action"]
     text: str
-    goal_um: Annotated[Vector, Shape("n"), "(2,) of goal; (0,) of others"] = field(default_factory=lambda: np.zeros(0))
+    goal_um: Annotated[Vector, Shape("n"), "(2,) of goal; (0,) of others"] = NOT_STATED
     speed_limit_um_s: Annotated[float | None, "of speed; None: the limit is taken away"] = None
 
 

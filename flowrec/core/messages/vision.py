@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
-
-from flowrec.core.declarations import Matrix, Message, Raster, Shape, Vector, Vector2
+from flowrec.core.declarations import NOT_STATED, Matrix, Message, Raster, Shape, Vector, Vector2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,12 +26,10 @@ class Track(Message):
         Vector,
         Shape("n"),
         "Motion of a robot that is tracked by its learned appearance, and the objects around it. (2,) mean; (0,): none",
-    ] = field(default_factory=lambda: np.zeros(0))
+    ] = NOT_STATED
     spread_px: Annotated[float, "mean distance from where it was expected"] = 0.0
     energy: Annotated[float, "mean of its squared foreground, in units of the noise's variance"] = 0.0
-    neighbours_px: Annotated[Vector, Shape("m"), "x, y and energy of each object nearby, (3 k,)"] = field(
-        default_factory=lambda: np.zeros(0)
-    )
+    neighbours_px: Annotated[Vector, Shape("m"), "x, y and energy of each object nearby, (3 k,)"] = NOT_STATED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,25 +10,19 @@ Linux limits both CPU time and memory, macOS CPU time; elsewhere the time is tha
 from __future__ import annotations
 
 import math
-import os
 import pickle
-import signal
-import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from flowrec.core.errors import FlowrecError, UsageError
-from flowrec.core.system.processes import child_command, child_environment
+from flowrec.core.system.child_process import ChildProcess, Parent
 
 Answer = TypeVar("Answer")
 
 MEMORY_BYTES = 3 << 30  # for one file, beyond what the libraries take
-_JOIN_S = 5.0
 
 
 class BoundedProcess:
@@ -46,9 +40,8 @@ class BoundedProcess:
         self, where: str, cpu_s: float, memory_bytes: int = MEMORY_BYTES, error: type[FlowrecError] = UsageError
     ) -> None:
         self._where, self._cpu_s, self._memory_bytes, self._error = where, cpu_s, memory_bytes, error
-        self._process: subprocess.Popen[bytes] | None = None
+        self._child: ChildProcess | None = None
         self._late = False  # ended by the clock, where the system limits no CPU time
-        self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
 
     def call(self, function: Callable[..., Answer], *given: Any) -> Answer:
         """The result of a function of a module, called in the child.
@@ -57,21 +50,17 @@ class BoundedProcess:
         ------
         FlowrecError : that of the function; or `error`, where it raised another, or went beyond a limit.
         """
-        process = self._process = self._process or self._start_child()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        timer = threading.Timer(self._cpu_s, self._end_late) if sys.platform == "win32" else None
+        child = self._child = self._child or self._start_child()
+        timer = threading.Timer(self._cpu_s, self._end_late, (child,))
         try:
-            if timer is not None:
+            if sys.platform == "win32":
                 timer.start()
-            pickle.dump((self._cpu_s, self._memory_bytes, function, given), process.stdin)
-            process.stdin.flush()
-            answer, failure = pickle.load(process.stdout)  # noqa: S301 - from our own process
+            child.send((self._cpu_s, self._memory_bytes, function, given))
+            answer, failure = child.receive()
         except (OSError, EOFError, pickle.UnpicklingError) as error:
-            raise self._error(f"{self._where}: {self._cause(process)}") from error
+            raise self._error(f"{self._where}: {self._cause(child)}") from error
         finally:
-            if timer is not None:
-                timer.cancel()
+            timer.cancel()
         if isinstance(failure, FlowrecError):
             raise failure
         if failure:
@@ -81,13 +70,8 @@ class BoundedProcess:
 
     def close(self) -> None:
         """End the child at once."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            for pipe in (self._process.stdin, self._process.stdout):
-                with suppress(OSError):  # the unread part of a call
-                    pipe.close()  # type: ignore[union-attr]
-        self._printed.close()
+        if self._child is not None:
+            self._child.close()
 
     def __enter__(self) -> Self:
         return self
@@ -95,34 +79,25 @@ class BoundedProcess:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _start_child(self) -> subprocess.Popen[bytes]:
+    def _start_child(self) -> ChildProcess:
         try:
-            return subprocess.Popen(  # noqa: S603 - our own module
-                child_command("flowrec.core.system.bounded_process"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._printed,
-                start_new_session=True,  # Ctrl-C ends the caller, and then the caller ends this
-                env=child_environment() | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            )
+            one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+            return ChildProcess("flowrec.core.system.bounded_process", one_thread)
         except OSError as error:
             raise self._error(f"{self._where}: no process starts to read it ({error.strerror or error})") from error
 
-    def _end_late(self) -> None:
+    def _end_late(self, child: ChildProcess) -> None:
         self._late = True
-        if self._process is not None:
-            self._process.kill()
+        child.process.kill()
 
-    def _cause(self, process: subprocess.Popen[bytes]) -> str:
+    def _cause(self, child: ChildProcess) -> str:
         """Reason that the child has ended without an answer."""
-        status = process.wait(_JOIN_S)
-        how = signal.Signals(-status).name if status < 0 else f"status {status}"
+        how = child.cause().removeprefix("killed by ").removeprefix("exit ")
         if self._late or how == "SIGXCPU":
             return self._words("time")
         if how == "SIGKILL":
             return self._words("memory")
-        self._printed.seek(0)
-        last = self._printed.read().decode(errors="replace").strip().rpartition("\n")[2]
+        last = child.last_line
         return f"its reader has ended ({how}{': ' + last[:300] if last else ''}); the file is damaged"
 
     def _words(self, failure: str) -> str:
@@ -157,14 +132,10 @@ def _limit_memory(memory_bytes: int) -> None:
 
 def _serve() -> None:
     """Answer calls until the caller has ended."""
-    calls, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints must not get between the answers
+    caller = Parent()
     limited = False
     while True:
-        try:
-            cpu_s, memory_bytes, function, given = pickle.load(calls)  # noqa: S301 - from our own caller
-        except EOFError:
-            return
+        cpu_s, memory_bytes, function, given = caller.order()
         _limit_time(cpu_s)
         if not limited:  # once, so that what one call leaves behind counts in the next
             _limit_memory(memory_bytes)
@@ -178,8 +149,7 @@ def _serve() -> None:
             answer = None, "memory"
         except Exception as error:  # noqa: BLE001  of as many kinds as there are libraries
             answer = None, f"{type(error).__name__}: {error}"[:500]
-        pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
-        answers.flush()
+        caller.answer(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def _open_locked(path: Path) -> Iterator[int]:
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         try:
-            take_lock(descriptor)
+            take_lock(descriptor, from_writer=True)
             if is_at(descriptor, path):  # the process before this one may have removed the file that it made
                 yield descriptor
                 return

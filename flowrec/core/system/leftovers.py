@@ -44,15 +44,11 @@ def remove_leftovers(folder: Path) -> list[Path]:
     -------
     What was removed, in order of name.
     """
-    removed = []
-    try:
-        with os.scandir(folder) as entries:
-            names = sorted(entry.name for entry in entries if entry.name.startswith(PREFIX))
-    except OSError:  # who writes into the folder says what is wrong with it
-        return []
-    for name in names:
-        path = folder / name
-        if _is_abandoned(name) and path.exists():
+    found, removed = [], []
+    with contextlib.suppress(OSError):  # who writes into the folder says what is wrong with it
+        found = sorted(folder.glob(f"{PREFIX}*"))
+    for path in found:
+        if _is_abandoned(path.name) and path.exists():
             with contextlib.suppress(OSError):  # of another user: nothing is lost, and it is no matter of this command
                 _complete_replacement(path)
                 if path.is_dir():

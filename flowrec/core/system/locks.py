@@ -50,7 +50,7 @@ def open_new(path: Path, *, overwrite: bool = False) -> FileIO:
             remove_idle(path)
             continue
         try:
-            _take(file.fileno())
+            take_lock(file.fileno())
             if is_at(file.fileno(), path):
                 return file
         except BlockingIOError:
@@ -77,7 +77,7 @@ def remove_idle(path: Path) -> None:
         path.unlink(missing_ok=True)  # a symbolic link to nothing
         return
     with file:
-        _take(file.fileno())
+        take_lock(file.fileno())
         if is_at(file.fileno(), path):
             path.unlink()
 
@@ -93,13 +93,11 @@ def hold_file(path: Path) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         try:
             file = stack.enter_context(FileIO(path, "r"))
-            _take(file.fileno())
+            take_lock(file.fileno())
         except BlockingIOError:
             raise
-        except (
-            OSError
-        ):  # the next reader reports why; some network file systems lock no file that is opened for reading
-            pass
+        except OSError:
+            pass  # the next reader reports why; some network file systems lock no file that is opened for reading
         yield
 
 
@@ -130,26 +128,22 @@ def try_lock(descriptor: int, *, exclusive: bool) -> bool:
     return True
 
 
-def take_lock(descriptor: int) -> None:
+def take_lock(descriptor: int, *, from_writer: bool = False) -> None:
     """Take the exclusive lock of an open file, when those have let go that hold it for moments.
+
+    Parameters
+    ----------
+    from_writer : whoever holds it exclusively is waited for, too.
 
     Raises
     ------
-    BlockingIOError : another process has held it for two seconds.
+    BlockingIOError : another process writes the file, or has held the lock for two seconds.
     """
     end_s = time.monotonic() + _TIMEOUT_S
     while not try_lock(descriptor, exclusive=True):
-        if time.monotonic() > end_s:
-            raise BlockingIOError(errno.EWOULDBLOCK, "another process has locked it")
-        time.sleep(_PAUSE_S)
-
-
-def _take(descriptor: int) -> None:
-    """Take the exclusive lock, after processes that only ask."""
-    end_s = time.monotonic() + _TIMEOUT_S
-    while not try_lock(descriptor, exclusive=True):
         # Only a writer refuses a shared lock.
-        if not try_lock(descriptor, exclusive=False) or time.monotonic() > end_s:
+        refused = not from_writer and not try_lock(descriptor, exclusive=False)
+        if refused or time.monotonic() > end_s:
             raise BlockingIOError(errno.EWOULDBLOCK, "another process has locked it")
         if sys.platform != "win32":
             fcntl.flock(descriptor, fcntl.LOCK_UN)

@@ -17,8 +17,7 @@ from typing import Any
 from flowrec.core.errors import SessionError
 from flowrec.core.system.durable import sync_directory, sync_file
 from flowrec.core.system.leftovers import MARKER, OLD, remove_leftovers_once, temporary_name
-from flowrec.core.system.outputs import OutputError, name_taken
-from flowrec.core.system.written import sha256_of
+from flowrec.core.system.outputs import OutputError, name_taken, sha256_of
 
 _WRITTEN = "sha256"  # of the files of a folder, by name
 
@@ -125,10 +124,8 @@ class OutputFolder:
             return
         if marker is None:
             raise OutputError(f"{path}: is a folder that flowrec export did not make, and stays; choose another name")
-        found, written = set(_files_in(path)), marker.get(_WRITTEN)
-        # A marker of an older flowrec lists what is in the folder itself, without hashes.
-        known = written or {name for name in found if name.partition("/")[0] in marker["entries"]}
-        if foreign := sorted(found - set(known)):
+        found, written = set(_files_in(path)), marker[_WRITTEN]
+        if foreign := sorted(found - written.keys()):
             raise OutputError(
                 f"{path}: holds {foreign[0]}, which flowrec export did not write; move it, or choose another name"
             )
@@ -140,8 +137,6 @@ class OutputFolder:
             return
         if any(marker.get(key) != value for key, value in self.facts.items()):
             raise name_taken(path, ", an export of another session or format")
-        if written is None:
-            raise name_taken(path, ", and does not say whether it was changed since")
         if changed := [name for name in sorted(found) if sha256_of(path / name) != written[name]]:
             raise name_taken(path, f", and {changed[0]} was changed since flowrec wrote it")
 
@@ -152,9 +147,7 @@ def marker_of(folder: Path) -> dict[str, Any] | None:
         marker = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    entries, written = (marker.get("entries"), marker.get(_WRITTEN, {})) if isinstance(marker, dict) else (None, None)
-    named = isinstance(entries, list) and all(isinstance(entry, str) for entry in entries)
-    return marker if named and isinstance(written, dict) else None
+    return marker if isinstance(marker, dict) and isinstance(marker.get(_WRITTEN), dict) else None
 
 
 def _files_in(folder: Path) -> list[str]:

@@ -1,21 +1,24 @@
 """Output files of every verb: an existing file is replaced only with --overwrite, and an input file never.
 
-A file gets its name when it is complete and on the disk. Sessions are written by store/, with the same rules.
+A file gets its name when it is complete and on the disk. Sessions are written by store/, with the same rules. An export
+is replaced without being asked for where it still is as flowrec has written it, which its hash says.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flowrec.core.errors import SessionError
-from flowrec.core.system.durable import replacing
+from flowrec.core.system.durable import replace_content, replacing
 from flowrec.core.system.leftovers import PREFIX
 from flowrec.core.system.locks import is_growing
-from flowrec.core.system.written import sha256_of
 
 MCAP = (".mcap",)
 RRD = (".rrd",)
@@ -25,6 +28,10 @@ FIGURE = (".png", ".pdf", ".svg")
 JSON = (".json",)
 TOML = (".toml",)
 WEIGHTS = (".safetensors",)
+
+# Hidden file of a folder: its exports that are single files. One that is a folder has a list of its own, its marker.
+LIST = ".flowrec_exports.json"
+_SHA256 = "sha256"
 
 
 class OutputError(SessionError):
@@ -139,3 +146,33 @@ def _same(output: Path, other: Path) -> bool:
         return output.samefile(other)
     except OSError:  # one of them is not there
         return output.resolve() == other.resolve()
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of what a file holds, in hexadecimal digits; OSError if it can not be read."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def written_sha256(path: Path, facts: Mapping[str, str]) -> str:
+    """The SHA-256 of the export that flowrec wrote to this path from the same facts; '' if there was none."""
+    noted = _read_list(path.parent / LIST).get(path.name)
+    if not isinstance(noted, dict) or any(noted.get(key) != value for key, value in facts.items()):
+        return ""
+    return str(noted.get(_SHA256, ""))
+
+
+def note_written(path: Path, facts: Mapping[str, str]) -> None:
+    """Keep the hash of an export that was just written; OSError if that is not possible."""
+    listed = {name: noted for name, noted in _read_list(path.parent / LIST).items() if path.with_name(name).exists()}
+    listed[path.name] = {**facts, _SHA256: sha256_of(path)}
+    replace_content(path.parent / LIST, json.dumps(listed, indent=1).encode())
+
+
+def _read_list(path: Path) -> dict[str, Any]:
+    """The list of a folder; one that is missing or damaged is empty."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return {name: noted for name, noted in found.items() if Path(name).name == name} if isinstance(found, dict) else {}

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
@@ -43,6 +44,29 @@ def child_environment() -> dict[str, str]:
     here = Path.cwd()
     kept = [place for place in sys.path if place and (place == home or Path(place).resolve() != here)]
     return os.environ | {"PYTHONPATH": os.pathsep.join(kept if home in kept else [home, *kept])}
+
+
+def start_child(
+    module: str, *words: str, environment: Mapping[str, str] | None = None, **given: Any
+) -> subprocess.Popen[bytes]:
+    """Start a module of flowrec as a program in a session of its own: what ends the child is its parent, not Ctrl-C.
+
+    Parameters
+    ----------
+    environment : variables besides those of every child.
+    given : as of subprocess.Popen; by default there are pipes to and from the child.
+
+    Raises
+    ------
+    OSError : it does not start.
+    """
+    process: subprocess.Popen[Any] = subprocess.Popen(  # noqa: S603 - our own module
+        child_command(module, *words),
+        start_new_session=True,
+        env=child_environment() | dict(environment or {}),
+        **({"stdin": subprocess.PIPE, "stdout": subprocess.PIPE} | given),
+    )
+    return process
 
 
 @contextmanager

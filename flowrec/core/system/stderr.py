@@ -135,10 +135,8 @@ class _Pump:
                 return
 
 
-@contextmanager
-def _vanished_is_no_error() -> Iterator[None]:
-    with contextlib.suppress(OSError, ValueError):
-        yield
+def _vanished_is_no_error() -> contextlib.suppress:
+    return contextlib.suppress(OSError, ValueError)
 
 
 def said_within(seconds: float, say: Callable[[], None]) -> bool:

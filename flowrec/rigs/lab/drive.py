@@ -90,7 +90,12 @@ class Drive:
             self.info = self._amplifier.open()
             stack.callback(self._amplifier.close)
             self._limits.check(self.info)
-            self._check_beats()
+            shortest_s = min(filter(None, (self._silence_s, self.info.timer_s)))
+            if shortest_s < 2.0 * BEAT_S:
+                raise UsageError(
+                    f"lab.guardian_s or the amplifier's timer = {shortest_s:g} s: the loop beats every {BEAT_S:g} s; "
+                    f"at least {2.0 * BEAT_S:g} s are needed"
+                )
             made = self._make_guardian(*self._amplifier.guard(), silence_s=self._silence_s)
             self._guardian = stack.enter_context(made)
             self._amplifier.arm()
@@ -186,14 +191,6 @@ class Drive:
         if self._taken_away and command.amplitude_mt > 0.0:  # zero() came while the command was on its way
             self._amplifier.zero()
 
-    def _check_beats(self) -> None:
-        shortest_s = min(filter(None, (self._silence_s, self.info.timer_s)))
-        if shortest_s < 2.0 * BEAT_S:
-            raise UsageError(
-                f"lab.guardian_s or the amplifier's timer = {shortest_s:g} s: the loop beats every {BEAT_S:g} s; at "
-                f"least {2.0 * BEAT_S:g} s are needed"
-            )
-
 
 @dataclass(frozen=True, slots=True)
 class CoilProbe:
@@ -204,18 +201,14 @@ class CoilProbe:
     info : of the amplifier.
     amplitude_mt, rotation_hz : the field that the limits permit.
     trip_s : time from a request to the guardian until the amplifier has confirmed that it is at zero.
-    silence_s : of the guardian.
     warnings : one line each.
-    only_hardware : what no program can do.
     """
 
     info: AmplifierInfo
     amplitude_mt: float
     rotation_hz: float
     trip_s: float
-    silence_s: float
     warnings: tuple[str, ...]
-    only_hardware: str = ONLY_HARDWARE
 
 
 def probe_amplifier(config: ResolvedConfig) -> CoilProbe:
@@ -243,4 +236,4 @@ def probe_amplifier(config: ResolvedConfig) -> CoilProbe:
         warnings.append(
             f"the coils make {limits.amplitude_mt:.3g} of coils.amplitude_mt = {config.coils.amplitude_mt:g}"
         )
-    return CoilProbe(info, limits.amplitude_mt, limits.rotation_hz, trip_s, config.lab.guardian_s, tuple(warnings))
+    return CoilProbe(info, limits.amplitude_mt, limits.rotation_hz, trip_s, tuple(warnings))

@@ -32,10 +32,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Self
 
-from flowrec.core import Priority, RigError, child_command, child_environment, prioritise_process
+from flowrec.core import Priority, RigError, prioritise_process, start_child
 
 SILENCE_S = 0.1
 ONLY_HARDWARE = (
@@ -89,14 +88,13 @@ class Guardian:
         self._status, write_status = os.pipe()
         command = [f"{self.silence_s:g}", str(read_beats), str(write_status), *self._action]
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - our own module
-                child_command(__name__ if __name__ != "__main__" else "flowrec.rigs.lab.guardian", *command),
+            self._process = start_child(
+                "flowrec.rigs.lab.guardian",
+                *command,
                 pass_fds=(read_beats, write_status, *self._descriptors),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
-                start_new_session=True,
-                env=child_environment(),
             )
         except OSError as error:
             self._release()
@@ -108,8 +106,10 @@ class Guardian:
             for end in (self._beats, self._status):
                 os.set_blocking(end, False)
         if self._report(b"ready", _START_S) is None:
-            said = self._last_words()
+            self._process.kill()
+            lines = self._process.communicate()[1].decode(errors="replace").strip().splitlines()
             self._release()
+            said = lines[-1] if lines else "it says nothing"
             raise RigError(f"the guardian process does not start: {said}; nothing is energised")
         return self
 
@@ -188,13 +188,6 @@ class Guardian:
             self._heard = (self._heard + said.replace(b".", b""))[-4096:]
         return True
 
-    def _last_words(self) -> str:
-        process = self._process
-        assert process is not None and process.stderr is not None
-        process.kill()
-        lines = process.stderr.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it says nothing"
-
     def _release(self) -> None:
         for end in (self._beats, self._status):
             if end >= 0:
@@ -245,7 +238,7 @@ def main(arguments: Sequence[str]) -> int:
     os.set_blocking(status, False)
     _say(status, "ready")
     cause = watch(
-        partial(_read_beats, beats),
+        lambda timeout_s: os.read(beats, 4096) if select.select([beats], [], [], timeout_s)[0] else None,
         silence_s,
         lambda: _say(status, ".", end=""),
         lambda: _say(status, f"probed {_try(zero)}"),
@@ -256,11 +249,6 @@ def main(arguments: Sequence[str]) -> int:
     how = _try(zero)
     _say(status, f"tripped {cause}; {how} in {1e3 * (time.monotonic() - begin_s):.0f} ms")
     return 3
-
-
-def _read_beats(beats: int, timeout_s: float | None) -> bytes | None:
-    """Read from the recorder; b'' at the end of its pipe; None: nothing in that time."""
-    return os.read(beats, 4096) if select.select([beats], [], [], timeout_s)[0] else None
 
 
 def watch(
@@ -274,7 +262,8 @@ def watch(
 
     Parameters
     ----------
-    heard : waits at most so many seconds (None: for ever) for what the recorder says, see `_heard`.
+    heard : waits at most so many seconds (None: for ever) for what the recorder says; b'' at the end of its pipe, None:
+        nothing in that time.
     silence_s : longest time between beats while a field is on.
     answer, probe : called after each beat, and when a probe is asked for.
     clock : monotonic time in s.

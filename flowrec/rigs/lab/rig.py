@@ -22,7 +22,7 @@ import numpy as np
 
 from flowrec.core import Applied, CameraLosses, Currents, Fit, Frame, Image, RigError, UsageError, nanoseconds
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
-from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
+from flowrec.rigs.lab.cameras.grabber import CAUSES, Captured, Grabber
 from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.stages import CAMERAS, Inputs, Pipeline, ResolvedConfig
 
@@ -85,18 +85,12 @@ class LabRig:
         self._told: set[str] = set()  # notes about the camera
         self._absent = False  # for the loop's thread only
 
-    @property
-    def info(self) -> CameraInfo:
-        """Properties that the camera reports; inside of `connected`."""
-        assert self._grabber is not None, "the devices are open"
-        return self._grabber.info
-
     @contextmanager
     def connected(self) -> Iterator[None]:
         with ExitStack() as stack:
             # The camera first: a guardian that waits for a camera is of no use.
             grabber = self._grabber = stack.enter_context(self._make_grabber())
-            stack.callback(self._forget)
+            stack.callback(setattr, self, "_grabber", None)
             self._check(grabber.info)
             self._tell_notes(grabber)
             if self.drive is not None:
@@ -188,27 +182,24 @@ class LabRig:
     def _check(self, info: CameraInfo) -> None:
         """Refuse a camera that delivers other images than configured."""
         camera = self._config.camera
-        name = " ".join(filter(None, (info.model, info.serial))) or "camera"
         if (info.width_px, info.height_px) != (camera.width_px, camera.height_px):
             raise RigError(
-                f"{name}: images of {info.width_px} x {info.height_px} pixels, where camera.width_px x camera.height_px"
-                f" = {camera.width_px} x {camera.height_px}; set them to what the camera can deliver"
+                f"{info.name}: images of {info.width_px} x {info.height_px} pixels, where camera.width_px x "
+                f"camera.height_px = {camera.width_px} x {camera.height_px}; set them to what the camera can deliver"
             )
         if info.bits != camera.bits:
             raise RigError(
-                f"{name}: images of {info.bits} bit ({info.pixel_format}), where camera.bits = {camera.bits}; set it, "
-                "or lab.pixel_format"
+                f"{info.name}: images of {info.bits} bit ({info.pixel_format}), where camera.bits = {camera.bits}; set "
+                "it, or lab.pixel_format"
             )
 
     def _tell_notes(self, grabber: Grabber) -> None:
         """Tell what the camera does otherwise than asked, each once; some is only known after seconds."""
-        info = grabber.info
-        name = " ".join(filter(None, (info.model, info.serial))) or "camera"
         for note in grabber.notes:
             about = note.partition(" asked")[0]
             if about not in self._told:
                 self._told.add(about)
-                self.tell(f"{name}: {note}")
+                self.tell(f"{grabber.info.name}: {note}")
 
     def _first(self, grabber: Grabber) -> Captured:
         """The newest frame: those that came while the run was prepared belong to no run."""
@@ -249,9 +240,6 @@ class LabRig:
     def _absent_ns(self, session: _Session) -> int:
         """Stamp of a tick without an image: before that of a frame whose exposure has begun."""
         return session.stamp_ns(time.monotonic_ns() - nanoseconds(self._config.camera.exposure_s + BEAT_S))
-
-    def _forget(self) -> None:
-        self._grabber = None
 
     # ---- the coils
 
@@ -308,12 +296,7 @@ class _Session:
                     stamp_ns=self.stamp_ns(since.stamp_ns),
                     ids=since.ids - first.ids + 1,
                     frames=since.frames - first.frames + 1,
-                    link=since.link - first.link,
-                    incomplete=since.incomplete - first.incomplete,
-                    driver=since.driver - first.driver,
-                    backlog=since.backlog - first.backlog,
-                    triggers=since.triggers - first.triggers,
-                    reconnections=since.reconnections - first.reconnections,
+                    **{cause: getattr(since, cause) - getattr(first, cause) for cause in CAUSES},
                 ),
             )
         return self._known[1]

@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from flowrec.core import UM_PER_M, FlowField, bilinear, compiled
 from flowrec.physics import Chip, Robot, sample, velocity_at, walls_of
-from flowrec.rigs.simulated.hindrance import FAXEN, Hindrance, hindered_velocity
-from flowrec.rigs.simulated.pump import Pump
-from flowrec.rigs.simulated.world import true_pump
+from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Hindrance, hindered_velocity
+from flowrec.rigs.simulated.world import Pump, true_pump
 from flowrec.stages import Simulated
 
 _SUBSTEP_S = 1.0 / 240.0  # at least eight to a frame at 30 per second, at most 4 um at 1000 um/s
 _CORRELATION_S = 1.0  # of the wander
 _BOLTZMANN_J_K = 1.380649e-23
-_NO_WALLS = np.zeros((3, 0, 0), np.float32)
 
 
 @compiled
@@ -112,7 +110,7 @@ class Swimmer:
     robot : as it truly is.
     field, clearance_um : the steady flow; (h, w) from pixel centres to walls.
     pump : of the flow; None: made of `simulated`.
-    hindrance : None: no drag of the side walls.
+    hindrance : drag of the side walls.
     """
 
     def __init__(
@@ -124,7 +122,7 @@ class Swimmer:
         clearance_um: NDArray[np.float32],
         um_per_px: float,
         pump: Pump | None = None,
-        hindrance: Hindrance | None = None,
+        hindrance: Hindrance = NO_HINDRANCE,
     ) -> None:
         self.position_um = np.array(position_um, np.float64)
         self.contacts = 0
@@ -133,7 +131,7 @@ class Swimmer:
         self._time_s = 0.0
         self._robot = robot
         self._pump = pump if pump is not None else true_pump(simulated)
-        self._hindrance = hindrance if hindrance is not None else Hindrance(0.0, _NO_WALLS)
+        self._hindrance = hindrance
         # Of the random walk after a second; the fluid's viscosity is that of the field.
         diffusion = _BOLTZMANN_J_K * simulated.value("temperature_k") / (6.0 * math.pi * field.viscosity_mpa_s * 1e-3)
         brownian_um = math.sqrt(2.0 * diffusion / (robot.radius_um * 1e-6)) * UM_PER_M
@@ -152,11 +150,7 @@ class Swimmer:
         """(2,) true flow at the centre; zero after it has left the chip."""
         if self.gone:
             return np.zeros(2)
-        return self._strength(self._time_s) * sample(self._field, self.position_um)
-
-    def _strength(self, time_s: float) -> float:
-        """The flow at a time divided by the steady one."""
-        return self._pump.strength(time_s)
+        return self._pump.strength(self._time_s) * sample(self._field, self.position_um)
 
     @property
     def clearance_um(self) -> float:
@@ -206,7 +200,7 @@ class Swimmer:
             noise,
             self._field.velocity_um_s,
             walls_of(self._field),
-            self._strength(self._time_s - 0.5 * dt * len(noise)),
+            self._pump.strength(self._time_s - 0.5 * dt * len(noise)),
             self._clearance,
             self._um_per_px,
             self._robot.radius_um,

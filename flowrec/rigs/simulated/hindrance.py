@@ -146,6 +146,9 @@ class Hindrance:
     walls: Rasters
 
 
+NO_HINDRANCE = Hindrance(0.0, np.zeros((3, 0, 0), np.float32))
+
+
 def walls_around(clearance_um: NDArray[np.float32], um_per_px: float) -> Rasters:
     """(3, h, w): from wall to wall through a pixel, um, along its normal; cosine and sine of twice the normal's angle.
 

@@ -33,8 +33,7 @@ from flowrec.core import (
 from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.rigs.simulated.true_coils import TrueCoils
-from flowrec.rigs.simulated.world import Shake, World, misregister, true_pump, true_robot, world_of
+from flowrec.rigs.simulated.world import Shake, TrueCoils, World, misregister, true_pump, true_robot, world_of
 from flowrec.stages import (
     Coils,
     FieldCommand,
@@ -266,9 +265,6 @@ class SimulatedRig:
         self.true_world()  # once for both
         yield from copy(self).inputs()
 
-    def _true_field(self) -> FlowField:
-        return self.true_world().field
-
     def true_world(self) -> World:
         """Flow and walls as they truly are, for evaluation."""
         if self._given is not None and self._given.velocity_um_s.shape[:2] != self._chip.mask.shape:
@@ -291,10 +287,11 @@ class SimulatedRig:
                 self._acting = Currents(now, 0.0, 0.0, 0.0, 0.0, np.zeros(_COILS), False)
             switch = self._coming[0][0] if self._coming else until_ns
             end = min(max(switch, now), until_ns)
-            if end > now and self._acting is None:
-                self._move(swimmer, seconds(end - now), 0.0, 0.0, 0.0)
-            elif end > now and self._acting is not None:
-                turns += self._turn(swimmer, self._acting, seconds(end - now))
+            lasts_s = seconds(end - now)
+            if lasts_s and self._acting is None:
+                self._move(swimmer, lasts_s, 0.0, 0.0, 0.0)
+            elif lasts_s and self._acting is not None:
+                turns += self._turn(swimmer, self._acting, lasts_s)
             now = end
             if not (self._coming and self._coming[0][0] <= now):
                 return turns

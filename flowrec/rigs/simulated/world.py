@@ -1,4 +1,4 @@
-"""The simulated world: true flow, walls, robot and registration, drawn from the seed for the rig.
+"""The simulated world: true flow, walls, pump, robot, coils and registration, drawn from the seed for the rig.
 
 Each quantity has random numbers of its own, so that a setting which states one leaves the others as they are. What was
 drawn is the note of the true field, for evaluation; no stage reads it.
@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowError, FlowField
+from flowrec.core import FlowError, FlowField, wrap_rad
 from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, median_width_um, with_settings
-from flowrec.rigs.simulated.hindrance import Hindrance, walls_around
-from flowrec.rigs.simulated.pump import Pump
+from flowrec.rigs.simulated.hindrance import NO_HINDRANCE, Hindrance, walls_around
 from flowrec.rigs.simulated.true_walls import at_centres, on_pixels, origin_um, true_walls
-from flowrec.stages import Simulated
+from flowrec.stages import Coils, Simulated
 
 _STREAM = 7  # of the seed; bodies, microscope, chip and clock have 1 to 6 and 8
 # In the order of their random numbers; new ones at the end.
@@ -27,6 +26,8 @@ _DRAWN = (
 )
 _PULSATION_HZ = (0.05, 2.0)  # of syringe and peristaltic pumps
 _LEAST_DEPTH_RADII = 2.2  # the robot fits in
+_DRIFT_STEP_S = 0.5  # of the pump, linear between
+_FARTHEST_DRIFT = 3.0  # standard deviations: the drift is cut off there
 
 
 def drawn_from(seed: int, quantity: str) -> np.random.Generator:
@@ -98,6 +99,56 @@ def true_robot(robot: Robot, simulated: Simulated) -> Robot:
     )
 
 
+class Pump:
+    """By what factor the flow differs from the steady one: (1 + drift) (1 + share sin(2 pi hz t + phase)).
+
+    The drift is a stationary Ornstein-Uhlenbeck process.
+
+    Parameters
+    ----------
+    pulsation_share, pulsation_hz, phase_rad : of the pulsation.
+    drift_share, drift_s : one sigma of the drift, and its correlation time.
+    rng : its random numbers.
+    """
+
+    def __init__(
+        self,
+        pulsation_share: float,
+        pulsation_hz: float,
+        phase_rad: float,
+        drift_share: float,
+        drift_s: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self._share, self._hz, self._phase_rad = pulsation_share, pulsation_hz, phase_rad
+        self._drift_share = drift_share
+        self._decay = math.exp(-_DRIFT_STEP_S / drift_s)
+        self._rng = rng
+        self._drift = [float(rng.standard_normal())]  # in standard deviations, every _DRIFT_STEP_S
+
+    def strength(self, time_s: float) -> float:
+        """The flow at a time over the steady one."""
+        pulsation = 1.0 + self._share * math.sin(2.0 * math.pi * self._hz * time_s + self._phase_rad)
+        return (1.0 + self._drift_at(time_s)) * pulsation if self._drift_share > 0.0 else pulsation
+
+    def mean_drift(self, until_s: float) -> float:
+        """Mean of 1 + drift from the start to a time: what a steady map of that time is, over the steady flow."""
+        if self._drift_share == 0.0:
+            return 1.0
+        times = np.arange(0.0, max(until_s, _DRIFT_STEP_S), _DRIFT_STEP_S)
+        return 1.0 + float(np.mean([self._drift_at(float(time)) for time in times]))
+
+    def _drift_at(self, time_s: float) -> float:
+        place = max(time_s, 0.0) / _DRIFT_STEP_S
+        index = int(place)
+        while len(self._drift) < index + 2:
+            kick = math.sqrt(1.0 - self._decay**2) * float(self._rng.standard_normal())
+            self._drift.append(self._decay * self._drift[-1] + kick)
+        before, after = self._drift[index : index + 2]
+        drift = before + (place - index) * (after - before)
+        return self._drift_share * min(max(drift, -_FARTHEST_DRIFT), _FARTHEST_DRIFT)
+
+
 def true_pump(simulated: Simulated) -> Pump:
     """The waveform of the pump."""
     seed, hz, phase_deg = simulated.seed, simulated.value("pulsation_hz"), simulated.value("pulsation_phase_deg")
@@ -156,6 +207,41 @@ class Shake:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TrueCoils:
+    """Coils whose calibration is wrong: the vector of their true field moves on an ellipse in a tilted plane.
+
+    The commanded field B(theta) = B0 (h sin theta + z cos theta) is made with the currents A^-1 B; with the true matrix
+    A' it is M B, M = A' A^-1. It turns about the normal of the plane of M h and M z, so the robot travels at an angle
+    to the heading; and it follows up to a frequency that is proportional to the shorter axis of the ellipse. What the
+    tilt takes of the rolled distance is of second order and left out, and so is a wrong bias.
+    """
+
+    coils: Coils  # as they are calibrated
+    made: NDArray[np.float64]  # (3, 3) M, from a commanded field to the true one
+
+    @classmethod
+    def of(cls, coils: Coils | None, simulated: Simulated) -> TrueCoils | None:
+        """The coils of a world; None: as they are calibrated."""
+        error = simulated.value("coil_error")
+        if coils is None or error == 0.0:
+            return None
+        stated = np.array(coils.mt_per_a)
+        draws = drawn_from(simulated.seed, "coils").uniform(-1.0, 1.0, (3, 3))
+        return cls(coils, np.eye(3) + error * draws * np.linalg.norm(stated, axis=0) @ np.linalg.inv(stated))
+
+    def motion(self, heading_rad: float) -> tuple[float, float]:
+        """The direction in which the robot travels when this heading is asked for, and the field's strength, 1: full.
+
+        The heading may be that of the plane or the opposite one: the answer turns with it.
+        """
+        forward, up = self.coils.field_mt([0.5 * math.pi, 0.0], heading_rad, 1.0)
+        asked, axis = np.cross(forward, up), np.cross(self.made @ forward, self.made @ up)
+        turned_rad = math.atan2(axis[1], axis[0]) - math.atan2(asked[1], asked[0])
+        ellipse = np.linalg.svd(self.made @ np.column_stack([forward, up]), compute_uv=False)
+        return wrap_rad(heading_rad + turned_rad), min(float(ellipse[-1]), 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class World:
     """Flow and walls of a world on the pixels of the chip."""
 
@@ -164,7 +250,7 @@ class World:
     mask: NDArray[np.bool_]  # of the true walls, which the microscope shows
     mask_um_per_px: float
     mask_origin_um: float  # where the centre of its first pixel lies, on either axis of the chip frame
-    hindrance: Hindrance | None
+    hindrance: Hindrance
 
 
 def world_of(
@@ -203,7 +289,7 @@ def world_of(
     if walls_um is None:
         walls_um = clearance_um(chip.mask, chip.um_per_px)
     share = simulated.value("hindrance")
-    hindrance = Hindrance(share, walls_around(walls_um, chip.um_per_px)) if share > 0.0 else None
+    hindrance = Hindrance(share, walls_around(walls_um, chip.um_per_px)) if share > 0.0 else NO_HINDRANCE
     return World(field, walls_um, mask, um_per_px, mask_origin_um, hindrance)
 
 

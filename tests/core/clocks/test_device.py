@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from flowrec.core.clocks import DeviceClock
-from flowrec.core.clocks.device_clock import envelope
+from flowrec.core.clocks.device_clock import DeviceClock, envelope
 
 
 @settings(max_examples=60)

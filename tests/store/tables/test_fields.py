@@ -10,7 +10,7 @@ import pytest
 
 import flowrec
 from flowrec.core.errors import UsageError
-from flowrec.core.field_views import fluid_of
+from flowrec.core.messages.slow_stages import fluid_of
 
 GOLDEN = Path(__file__).parents[3] / "sessions" / "golden.mcap"
 

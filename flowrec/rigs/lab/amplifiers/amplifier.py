@@ -11,6 +11,13 @@ from typing import Protocol
 
 from flowrec.stages import FieldCommand, FieldLog
 
+KEEP_S = 120.0  # of the log of an output
+
+
+def not_before(log: FieldLog, stamp_ns: int) -> int:
+    """The stamp of the next row of a log: this one, or that of the last row, if it is later."""
+    return max(stamp_ns, int(log.times_ns[-1])) if len(log) else stamp_ns
+
 
 @dataclass(frozen=True, slots=True)
 class AmplifierInfo:

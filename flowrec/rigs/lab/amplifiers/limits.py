@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,6 @@ _TURN_RAD = 2.0 * math.pi
 _ROUNDING = 1e-9  # relative
 
 
-@dataclass(slots=True)
 class CommandLimits:
     """Limits of one rig. It remembers for how long the coils were energised.
 
@@ -39,21 +37,16 @@ class CommandLimits:
     on_left_s : time for which the coils may still be energised.
     """
 
-    coils: Coils
-    robot: Robot
-    output: OutputLimits
-    tell: Callable[[str], None] = lambda _text: None
-    amplitude_mt: float = field(init=False)
-    rotation_hz: float = field(init=False)
-    on_left_s: float = field(init=False)
-    _resting: bool = field(default=False, init=False)
-    _last: tuple[int, bool] | None = field(default=None, init=False)  # time of the last command; with a field?
-    _told: set[str] = field(default_factory=set, init=False)
-
-    def __post_init__(self) -> None:
-        self.amplitude_mt = self.coils.full_mt(self.robot)
-        self.rotation_hz = self.coils.fastest_um_s(self.robot) / self.robot.um_per_rev
-        self.on_left_s = self.output.longest_on_s
+    def __init__(
+        self, coils: Coils, robot: Robot, output: OutputLimits, tell: Callable[[str], None] = lambda _text: None
+    ) -> None:
+        self.coils, self.output, self.tell = coils, output, tell
+        self.amplitude_mt = coils.full_mt(robot)
+        self.rotation_hz = coils.fastest_um_s(robot) / robot.um_per_rev
+        self.on_left_s = output.longest_on_s
+        self._resting = False
+        self._last: tuple[int, bool] | None = None  # time of the last command; with a field?
+        self._told: set[str] = set()
         need = self.slew_a_s
         if self.output.slew_a_s is not None and need > self.output.slew_a_s:
             raise UsageError(

@@ -7,16 +7,18 @@ import select
 import subprocess
 import time
 from collections import deque
+from dataclasses import dataclass
 from multiprocessing import Pipe
 from typing import TYPE_CHECKING, Any, Self
 
 import nidaqmx  # noqa: F401  here, so that a missing package is stated before a process is started
 import numpy as np
+from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, RigError, child_command, child_environment
-from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.ni_orders import NiSettings, Played
-from flowrec.stages import FieldCommand, FieldLog
+from flowrec.core import NS_PER_S, RigError, start_child
+from flowrec.physics import Robot
+from flowrec.rigs.lab.amplifiers.amplifier import KEEP_S, AmplifierInfo, not_before
+from flowrec.stages import Coils, FieldCommand, FieldLog, MotionSegment, OutputLimits
 
 if TYPE_CHECKING:
     from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
@@ -25,7 +27,28 @@ _START_S = 60.0  # the package of NI takes seconds to load on a busy computer, a
 _ZERO_S = 0.5
 _SILENT_S = 0.5  # a process that has written no block for so long is stuck
 _END_S = 5.0
-_KEEP_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class NiSettings:
+    """Settings of the process."""
+
+    channels: str
+    server: str
+    coils: Coils
+    robot: Robot
+    output: OutputLimits
+    silence_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """A block that was written: when its first sample is put out, on the host's monotonic clock, and what it does."""
+
+    from_ns: int
+    segments: tuple[MotionSegment, ...]
+    amplitude_mt: float
+    currents_a: NDArray[np.float64]  # (3,) at the first sample
 
 
 class NiAmplifier:
@@ -63,13 +86,12 @@ class NiAmplifier:
         ours, theirs = Pipe()
         descriptors = (theirs.fileno(), here[0], there[1])
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - our own module
-                child_command("flowrec.rigs.lab.amplifiers.ni_process", *map(str, descriptors)),
+            self._process = start_child(
+                "flowrec.rigs.lab.amplifiers.ni_process",
+                *map(str, descriptors),
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C ends the run, which takes the field down its ramp, and then this
-                env=child_environment(),
             )
         finally:
             theirs.close()
@@ -110,11 +132,13 @@ class NiAmplifier:
     def put_out(self, until_ns: int) -> FieldLog:
         self._hear()
         while self._cuts:
-            self._cut(self._cuts.popleft())
-        while self._played and self._played[0].from_ns <= until_ns:
-            one = self._played.popleft()
-            self._log.extend(self._not_before(one.from_ns), one.segments, one.amplitude_mt, one.currents_a)
-        self._log.forget(until_ns - round(_KEEP_S * NS_PER_S))
+            # Blocks that were written for later than a cut were not put out.
+            cut_ns = self._cuts.popleft()
+            self._log_played(cut_ns)
+            self._played.clear()
+            self._log.append(not_before(self._log, cut_ns), 0.0, 0.0, 0.0, np.zeros(3))
+        self._log_played(until_ns + 1)
+        self._log.forget(until_ns - round(KEEP_S * NS_PER_S))
         return self._log
 
     def zero(self) -> None:
@@ -150,15 +174,18 @@ class NiAmplifier:
 
     def _hear(self) -> None:
         """Take in what the process reports. Does not wait."""
-        while self._connection is not None and not self._fault:
-            try:
-                if not self._connection.poll():
-                    return
-                self._report(*self._connection.recv())
-            except (EOFError, OSError):
-                self._fault = "its process has ended"
+        while self._connection is not None and not self._fault and self._report(0.0) is not None:
+            pass
 
-    def _report(self, what: str, *given: Any) -> tuple[str, Any]:
+    def _report(self, timeout_s: float) -> tuple[str, Any] | None:
+        """Take in the next report, which is returned; None: there is none in that time, or the process has ended."""
+        try:
+            if not self._connection.poll(timeout_s):
+                return None
+            what, *given = self._connection.recv()
+        except (EOFError, OSError):
+            self._fault = "its process has ended"
+            return None
         if what == "block":
             self._played.append(given[0])
             self._played_s = time.monotonic()
@@ -169,27 +196,19 @@ class NiAmplifier:
         return what, given[0] if given else None
 
     def _wait(self, wanted: str, timeout_s: float) -> Any:
-        assert self._connection is not None
         end_s = time.monotonic() + timeout_s
         while not self._fault:
-            if not self._connection.poll(max(end_s - time.monotonic(), 0.0)):
+            report = self._report(max(end_s - time.monotonic(), 0.0))
+            if report is not None and report[0] == wanted:
+                return report[1]
+            if report is None and not self._fault:
                 raise RigError(f"the process of the NI output does not answer in {timeout_s:g} s")
-            try:
-                what, given = self._report(*self._connection.recv())
-            except (EOFError, OSError) as error:
-                raise RigError("the process of the NI output has ended") from error
-            if what == wanted:
-                return given
+            if report is None:
+                raise RigError("the process of the NI output has ended")
         raise RigError(self._fault)
 
-    def _cut(self, at_ns: int) -> None:
-        """End the log at a time: blocks that were written for later were not put out."""
-        while self._played and self._played[0].from_ns < at_ns:
+    def _log_played(self, before_ns: int) -> None:
+        """Log the blocks that begin before a time."""
+        while self._played and self._played[0].from_ns < before_ns:
             one = self._played.popleft()
-            self._log.extend(self._not_before(one.from_ns), one.segments, one.amplitude_mt, one.currents_a)
-        self._played.clear()
-        self._log.append(self._not_before(at_ns), 0.0, 0.0, 0.0, np.zeros(3))
-
-    def _not_before(self, stamp_ns: int) -> int:
-        times = self._log.times_ns
-        return max(stamp_ns, int(times[-1])) if len(times) else stamp_ns
+            self._log.extend(not_before(self._log, one.from_ns), one.segments, one.amplitude_mt, one.currents_a)

@@ -23,8 +23,8 @@ from typing import Any
 
 from flowrec.core import NS_PER_S, DeviceClock, Fit, FlowrecError, Priority, RigError, prioritise_process, seconds
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.rigs.lab.amplifiers.ni import NiSettings, Played
 from flowrec.rigs.lab.amplifiers.ni_device import NiDevice, reason
-from flowrec.rigs.lab.amplifiers.ni_orders import NiSettings, Played
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
 from flowrec.stages import FieldCommand
 

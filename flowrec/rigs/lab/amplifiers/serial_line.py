@@ -21,7 +21,7 @@ import serial
 from serial.tools import list_ports
 
 from flowrec.core import NS_PER_S, DeviceClock, Fit, Priority, RigError, UsageError, realtime_priority, seconds
-from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
+from flowrec.rigs.lab.amplifiers.amplifier import KEEP_S, AmplifierInfo, not_before
 from flowrec.rigs.lab.amplifiers.serial_protocol import (
     VERSION,
     ZERO,
@@ -44,7 +44,6 @@ _CONFIRM_S = 0.25
 _CONFIGURE_S = 2.0
 _SILENT_S = 0.4  # a board that answers no command for so long does not answer
 _LEAST_S = 0.008  # between two lines: a line and its answer take that long at 115200 baud
-_KEEP_S = 120.0
 _TURNS = 1e-6
 _WRAP = 1 << 32
 
@@ -140,7 +139,7 @@ class SerialAmplifier:
         """Log of the output. The last row lasts on; the next answer replaces its frequency and heading by the means."""
         while self._measured:
             self._take(*self._measured.popleft())
-        self._log.forget(until_ns - round(_KEEP_S * NS_PER_S))
+        self._log.forget(until_ns - round(KEEP_S * NS_PER_S))
         return self._log
 
     def zero(self) -> None:
@@ -179,14 +178,18 @@ class SerialAmplifier:
             # Another recorder is kept out; the guardian has the same descriptor, and so keeps others out as well.
             return serial.Serial(self._name, self._baud, timeout=0, write_timeout=0, exclusive=True)
         except (serial.SerialException, OSError, ValueError) as error:
-            if error.errno in (errno.EAGAIN, errno.EBUSY) if isinstance(error, OSError) else False:
+            number = getattr(error, "errno", None)
+            if number in (errno.EAGAIN, errno.EBUSY):
                 raise RigError(
                     f"{self._name}: another program uses this port; close it, or its guardian ends"
                 ) from error
-            if isinstance(error, OSError) and error.errno == errno.EACCES:
+            if number == errno.EACCES:
                 raise RigError(f"{self._name}: no right to use this port; sudo adduser $USER dialout") from error
-            gone = isinstance(error, OSError) and error.errno == errno.ENOENT
-            why = "there is no such port" if gone else f"it can not be used as a serial port ({_first_line(error)})"
+            why = (
+                "there is no such port"
+                if number == errno.ENOENT
+                else f"it can not be used as a serial port ({_first_line(error)})"
+            )
             raise RigError(f"lab.serial.port = {self._name!r}: {why}; ports here: {there}") from error
 
     def _identify(self) -> AmplifierInfo:
@@ -260,11 +263,8 @@ class SerialAmplifier:
 
     # ---- the reader's thread
 
+    @realtime_priority(Priority.DEVICE)  # what it reads is stamped on arrival
     def _read(self) -> None:
-        with realtime_priority(Priority.DEVICE):  # what it reads is stamped on arrival
-            self._read_lines()
-
-    def _read_lines(self) -> None:
         assert self._port is not None
         descriptor, rest = self._port.fileno(), b""
         while not self._closing:
@@ -330,9 +330,9 @@ class SerialAmplifier:
         self._before = (stamp_ns, now)
 
     def _append(self, stamp_ns: int, now: Telemetry) -> None:
-        times = self._log.times_ns
-        stamp_ns = max(stamp_ns, int(times[-1])) if len(times) else stamp_ns
-        self._log.append(stamp_ns, now.frequency_hz, now.heading_rad, now.amplitude_mt, now.currents_a)
+        self._log.append(
+            not_before(self._log, stamp_ns), now.frequency_hz, now.heading_rad, now.amplitude_mt, now.currents_a
+        )
 
 
 _NO_FIELD = Telemetry(0, 0.0, 0.0, 0.0, (0, 0), FieldLog().at(0).currents_a)

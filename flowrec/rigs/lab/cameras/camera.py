@@ -84,6 +84,11 @@ class CameraInfo:
     ticks_per_s: float = 0.0
     notes: tuple[str, ...] = ()
 
+    @property
+    def name(self) -> str:
+        """Model and serial number, for people."""
+        return " ".join(filter(None, (self.model, self.serial))) or "camera"
+
 
 @dataclass(frozen=True, slots=True)
 class Grabbed:

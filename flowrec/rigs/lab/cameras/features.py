@@ -35,11 +35,14 @@ class Feature:
     writable: bool = True
 
 
+ABSENT = Feature(None, writable=False)  # of a setting that the device does not have, or not now
+
+
 class Features(Protocol):
     """The settings of one device."""
 
-    def feature(self, name: str) -> Feature | None:
-        """The setting of this name; None if the device does not have it, or not now."""
+    def feature(self, name: str) -> Feature:
+        """The setting of this name; ABSENT if the device does not have it, or not now."""
 
     def put(self, name: str, value: Value) -> None:
         """Set it.
@@ -48,6 +51,14 @@ class Features(Protocol):
         ------
         RigError : the device refuses.
         """
+
+    def value(self, name: str) -> Value | None:
+        """Its value; None if the device does not have it, or it can not be read."""
+        return self.feature(name).value
+
+    def id_bits(self, gige: bool) -> int:
+        """Length of the block ids: GigE Vision has short ones, unless the extended ones are switched on."""
+        return 16 if gige and self.value("GevGVSPExtendedIDMode") != "On" else 64
 
 
 def configure(device: Features, wanted: Wanted) -> CameraInfo:
@@ -60,10 +71,15 @@ def configure(device: Features, wanted: Wanted) -> CameraInfo:
     notes: list[str] = []
     pixel_format = _pixel_format(device, wanted.pixel_format)
     width_px, height_px = _region(device, wanted)
-    _choose(device, ("AcquisitionMode",), "Continuous")
+    _choose(device, "AcquisitionMode", "Continuous")
     _trigger(device, wanted.trigger)
-    exposure_s = _exposure(device, wanted.exposure_s, notes)
-    gain = _gain(device, wanted.gain, notes)
+    _choose(device, "ExposureAuto", "Off")
+    _choose(device, "ExposureMode", "Timed")
+    exposures, asked_s = ("ExposureTime", "ExposureTimeAbs"), wanted.exposure_s or None
+    exposure_s = _set_number(device, exposures, "camera.exposure_s", asked_s, "s", notes, _US) or 0.0
+    if wanted.gain is not None:
+        _choose(device, "GainAuto", "Off")
+    gain = _set_number(device, ("Gain", "GainRaw", "GainAbs"), "lab.gain", wanted.gain, "", notes)
     rate_hz = _rate(device, wanted, notes)
     return CameraInfo(
         model="",
@@ -83,7 +99,7 @@ def _pixel_format(device: Features, asked: str) -> str:
     """Set the pixel format, or another one of the same depth: packed or not, it holds the same data."""
     plain = f"Mono{bits_of(asked)}"
     have = device.feature("PixelFormat")
-    if have is None:
+    if have is ABSENT:
         raise RigError("the camera has no setting PixelFormat; it is no area camera by GenICam")
     same = [name for name in (asked, plain, f"{plain}p", f"{plain}Packed") if name in have.entries]
     if not same:
@@ -98,16 +114,16 @@ def _region(device: Features, wanted: Wanted) -> tuple[int, int]:
     axes = (("Width", "OffsetX", "width_px", wanted.width_px), ("Height", "OffsetY", "height_px", wanted.height_px))
     sizes = []
     for axis, (size, offset, key, asked) in enumerate(axes):
-        if _writable(device.feature(offset)):
+        if device.feature(offset).writable:
             device.put(offset, 0)
         have = device.feature(size)
-        if have is None or (not have.writable and have.value != asked):
-            raise RigError(
-                f"camera.{key} = {asked}: the size of the camera's image can not be set; it is {have and have.value}"
-            )
         if have.value != asked:
-            if not have.low <= asked <= have.high or (asked - have.low) % (have.step or 1):
-                step = have.step or 1
+            if not have.writable:
+                raise RigError(
+                    f"camera.{key} = {asked}: the size of the camera's image can not be set; it is {have.value}"
+                )
+            step = have.step or 1
+            if not have.low <= asked <= have.high or (asked - have.low) % step:
                 nearest = have.low + round((min(max(asked, have.low), have.high) - have.low) / step) * step
                 raise RigError(
                     f"camera.{key} = {asked}: the camera takes {have.low:g} to {have.high:g} in steps of {step:g}; the "
@@ -115,18 +131,16 @@ def _region(device: Features, wanted: Wanted) -> tuple[int, int]:
                 )
             device.put(size, asked)
         place = device.feature(offset)
-        if place is not None and place.writable:
+        if place.writable:
             middle = place.high / 2 // (place.step or 1) * (place.step or 1)
             at = int(middle) if wanted.offset_px is None else wanted.offset_px[axis]
             device.put(offset, at)
-        elif wanted.offset_px is not None and wanted.offset_px[axis] != (place.value if place else 0):
+        elif wanted.offset_px is not None and wanted.offset_px[axis] != (0 if place is ABSENT else place.value):
             setting = ("lab.offset_x_px", "lab.offset_y_px")[axis]
             raise RigError(f"{setting}: the camera has no {offset} that can be set")
         got = device.feature(size)
-        if got is None or got.value != asked:
-            raise RigError(
-                f"camera.{key} = {asked}: the camera has set {got and got.value}; set that, or see to its binning"
-            )
+        if got.value != asked:
+            raise RigError(f"camera.{key} = {asked}: the camera has set {got.value}; set that, or see to its binning")
         sizes.append(asked)
     return sizes[0], sizes[1]
 
@@ -134,57 +148,46 @@ def _region(device: Features, wanted: Wanted) -> tuple[int, int]:
 def _trigger(device: Features, asked: str) -> None:
     """Switch the triggers off, or the one of the frame on."""
     selector, mode = device.feature("TriggerSelector"), device.feature("TriggerMode")
-    if mode is None:
+    if mode is ABSENT:
         if asked:
             raise RigError(f"lab.trigger = {asked!r}: the camera has no trigger")
         return
-    for each in selector.entries if selector is not None else ():
-        if _writable(selector):
+    for each in selector.entries:
+        if selector.writable:
             device.put("TriggerSelector", each)
-        if _writable(now := device.feature("TriggerMode")) and now is not None and now.value != "Off":
+        now = device.feature("TriggerMode")
+        if now.writable and now.value != "Off":
             device.put("TriggerMode", "Off")
-    if selector is None:
+    if selector is ABSENT:
         device.put("TriggerMode", "Off")
     if not asked:
         return
-    if selector is not None and "FrameStart" in selector.entries:
+    if "FrameStart" in selector.entries:
         device.put("TriggerSelector", "FrameStart")
     source = device.feature("TriggerSource")
     name = "Software" if asked == SOFTWARE else asked
-    if source is None or name not in source.entries:
-        entries = ", ".join(source.entries) if source is not None else "none"
+    if name not in source.entries:
+        entries = "none" if source is ABSENT else ", ".join(source.entries)
         raise RigError(f"lab.trigger = {asked!r}: the camera has no such source of a trigger; it has {entries}")
     device.put("TriggerSource", name)
     device.put("TriggerMode", "On")
 
 
-def _exposure(device: Features, asked_s: float, notes: list[str]) -> float:
-    """Set the exposure in s; returns what it is, 0 if the device does not say."""
-    _choose(device, ("ExposureAuto",), "Off")
-    _choose(device, ("ExposureMode",), "Timed")
-    name = _first(device, "ExposureTime", "ExposureTimeAbs")
-    if name is None:
-        notes.extend(difference("camera.exposure_s", asked_s or None, None, "s"))
-        return 0.0
-    if asked_s:
-        _put_clipped(device, name, asked_s / _US)
-    got_s = _number(device, name) * _US
-    notes.extend(difference("camera.exposure_s", asked_s or None, got_s, "s"))
-    return got_s
-
-
-def _gain(device: Features, asked: float | None, notes: list[str]) -> float | None:
-    """Set the gain; returns what it is, None if the device does not say."""
-    if asked is not None:
-        _choose(device, ("GainAuto",), "Off")
-    name = _first(device, "Gain", "GainRaw", "GainAbs")
-    if name is None:
-        notes.extend(difference("lab.gain", asked, None, ""))
-        return None
-    if asked is not None:
-        _put_clipped(device, name, asked)
-    got = _number(device, name)
-    notes.extend(difference("lab.gain", asked, got, ""))
+def _set_number(
+    device: Features,
+    names: tuple[str, ...],
+    key: str,
+    asked: float | None,
+    unit: str,
+    notes: list[str],
+    scale: float = 1.0,
+) -> float | None:
+    """Set a number that is asked for in `scale` units of the device; what it is, None if the device does not say."""
+    name = _first(device, *names)
+    if name is not None and asked is not None:
+        _put_clipped(device, name, asked / scale)
+    got = None if name is None else _number(device, name) * scale
+    notes.extend(difference(key, asked, got, unit))
     return got
 
 
@@ -192,11 +195,10 @@ def _rate(device: Features, wanted: Wanted, notes: list[str]) -> float:
     """Set the rate in Hz; returns the one that is reached, 0 if the device does not say."""
     free = not wanted.trigger
     for switch in ("AcquisitionFrameRateEnable", "AcquisitionFrameRateControlEnabled"):
-        if _writable(device.feature(switch)):
+        if device.feature(switch).writable:
             device.put(switch, free)
     name = _first(device, "AcquisitionFrameRate", "AcquisitionFrameRateAbs")
-    now = device.feature(name) if name is not None else None
-    if free and name is not None and now is not None and now.writable:
+    if free and name is not None:
         _put_clipped(device, name, wanted.rate_hz)
     reached = _first(device, "ResultingFrameRate", "ResultingFrameRateAbs", "AcquisitionResultingFrameRate", name or "")
     if reached is None:
@@ -210,24 +212,17 @@ def _rate(device: Features, wanted: Wanted, notes: list[str]) -> float:
 
 def _first(device: Features, *names: str) -> str | None:
     """The first of some names that the device has and that can be read."""
-    return next(
-        (name for name in names if (found := device.feature(name)) is not None and found.value is not None), None
-    )
+    return next((name for name in names if device.value(name) is not None), None)
 
 
 def _number(device: Features, name: str) -> float:
-    found = device.feature(name)
-    return float(found.value) if found is not None and found.value is not None else 0.0
-
-
-def _writable(feature: Feature | None) -> bool:
-    return feature is not None and feature.writable
+    return float(device.value(name) or 0.0)
 
 
 def _put_clipped(device: Features, name: str, value: float) -> None:
     """Set a number to the nearest one that the device takes."""
     have = device.feature(name)
-    if have is None or not have.writable:
+    if not have.writable:
         return
     value = min(max(value, have.low), have.high) if have.low < have.high else value
     if isinstance(have.value, int):
@@ -236,9 +231,8 @@ def _put_clipped(device: Features, name: str, value: float) -> None:
     device.put(name, value)
 
 
-def _choose(device: Features, names: tuple[str, ...], entry: str) -> None:
-    """Set those enumerations that the device has and that have the entry."""
-    for name in names:
-        have = device.feature(name)
-        if have is not None and have.writable and entry in have.entries and have.value != entry:
-            device.put(name, entry)
+def _choose(device: Features, name: str, entry: str) -> None:
+    """Set an enumeration, where the device has it and it has the entry."""
+    have = device.feature(name)
+    if have.writable and entry in have.entries and have.value != entry:
+        device.put(name, entry)

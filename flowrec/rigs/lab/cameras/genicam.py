@@ -15,7 +15,7 @@ import viva_genicam as vg
 
 from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
-from flowrec.rigs.lab.cameras.features import Feature, Value, configure
+from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
 _DISCOVER_MS = 500
 _GIGE = "gige"
@@ -62,12 +62,11 @@ class GenicamCamera:
             stream = camera.stream(deliver_incomplete=True, auto_packet_size=camera.transport == _GIGE)
             self._stream = stream.__enter__()
             self._stack.callback(_quietly, stream.__exit__, None, None, None)
-            extended = nodes.value("GevGVSPExtendedIDMode") == "On"
             return replace(
                 settled,
                 model=f"{nodes.value('DeviceVendorName') or ''} {nodes.value('DeviceModelName') or name}".strip(),
                 serial=str(nodes.value("DeviceSerialNumber") or nodes.value("DeviceID") or ""),
-                id_bits=16 if camera.transport == _GIGE and not extended else 64,
+                id_bits=nodes.id_bits(camera.transport == _GIGE),
                 ticks_per_s=_ticks_per_s(camera, nodes),
             )
         except vg.GenicamError as error:
@@ -134,27 +133,22 @@ class GenicamCamera:
         return name, device
 
 
-class _GenicamNodes:
+class _GenicamNodes(Features):
     """The settings of a camera; see features.Features."""
 
     def __init__(self, camera: vg.Camera) -> None:
         self._camera = camera
         self._names = frozenset(camera.nodes())
 
-    def feature(self, name: str) -> Feature | None:
+    def feature(self, name: str) -> Feature:
         if name not in self._names:
-            return None
+            return ABSENT
         state = self._camera.feature_state(name)
         if not (state.is_implemented and state.is_available):
-            return None
+            return ABSENT
         low, high, step = (state.range.min, state.range.max, state.range.inc) if state.range else (0.0, 0.0, 0.0)
         writable = state.access in ("RW", "WO")
         return Feature(state.value, low, high, step or 0.0, tuple(state.enum_entries or ()), writable)
-
-    def value(self, name: str) -> Value | None:
-        """Its value; None if the device does not have it."""
-        found = self.feature(name)
-        return found.value if found is not None else None
 
     def put(self, name: str, value: Value) -> None:
         try:

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import TracebackType
+from operator import attrgetter
 from typing import Self, TypeVar
 
 from flowrec.core import (
@@ -45,6 +45,10 @@ _RATE_S = 2.0  # over which a rate is measured, at least
 _RATE_ERROR = 0.03  # relative difference of the rate that is worth a note
 _FROZEN = 2  # frames in a row with the same device time: the clock stands still, and is not used
 
+CAUSES = ("link", "incomplete", "driver", "backlog", "triggers", "reconnections")  # fields of CameraLosses
+_loss_counts = attrgetter(*CAUSES)
+_identity = attrgetter("model", "serial", "width_px", "height_px", "bits")  # of a CameraInfo
+
 _T = TypeVar("_T")
 
 
@@ -56,10 +60,10 @@ class Captured:
     ----------
     image, bits : (height, width), uint8 for 8 bits, else uint16 with values below 2**bits.
     index : counts the blocks of the device from the first one on; what is missing was lost.
-    stamp_ns : middle of the exposure on the session clock: arrival by the fit of the device's clock, less half of the
-        exposure; strictly increasing. The time from the end of the exposure to the earliest arrival (readout and
+    stamp_ns : middle of the exposure on the host's monotonic clock: arrival by the fit of the device's clock, less half
+        of the exposure; strictly increasing. The time from the end of the exposure to the earliest arrival (readout and
         transfer, which is constant) remains in it.
-    arrival_ns : on the session clock.
+    arrival_ns : on the host's monotonic clock.
     clock : the fit, with which the stamp was made; None: the device has no clock, or it stands still.
     losses : by cause; the same message until something more is lost, or a second has passed, so that few are written.
         `Grabber.losses` is that of this frame.
@@ -89,32 +93,29 @@ class Grabber:
     make : makes the camera, not yet open; again for each new connection, because a driver may hang in the old one.
     wanted : as `make` uses it: exposure, rate and trigger.
     length : frames in the queue.
-    epoch_ns : zero of the session clock on the host's monotonic clock.
 
     Attributes
     ----------
     info : what the camera says of itself; valid once the context is entered.
     absent : why no frame comes, for people; '' while the camera delivers, or waits for a trigger.
-    absent_since_ns : on the host's monotonic clock, when the last frame came; of use while `absent`.
+    losses : up to the latest frame that was handed on; None before the first one.
     frames : handed on.
     backlog : dropped, because the queue was full.
     """
 
-    def __init__(self, make: Callable[[], Camera], wanted: Wanted, length: int = 8, epoch_ns: int = 0) -> None:
+    def __init__(self, make: Callable[[], Camera], wanted: Wanted, length: int = 8) -> None:
         self.absent = ""
-        self.absent_since_ns = 0
+        self.losses: CameraLosses | None = None
         self.frames = self.backlog = 0
         self._make = make
         self._wanted = wanted
         self._length = length
-        self._epoch_ns = epoch_ns
         self._queue: deque[Captured] = deque()
         self._filled = threading.Condition()
         self._opened = threading.Event()
         self._over = threading.Event()
         self._failure: Exception | None = None
         self._info: CameraInfo | None = None
-        self._exact: CameraLosses | None = None  # up to the latest frame that was handed on
         self._reported: CameraLosses | None = None  # the latest one that a frame came with
         # Of the thread only.
         self._ids = BlockIds()
@@ -152,11 +153,6 @@ class Grabber:
         span_s = seconds(last_ns - stamp_ns)
         return (last_index - index) / span_s if span_s > _RATE_S else 0.0
 
-    @property
-    def losses(self) -> CameraLosses | None:
-        """The losses up to the latest frame that was handed on; None before the first one."""
-        return self._exact
-
     def __enter__(self) -> Self:
         self._thread.start()
         try:
@@ -169,9 +165,7 @@ class Grabber:
             raise self._failure
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -197,7 +191,7 @@ class Grabber:
             frame = self._queue.popleft()
             self.frames += 1
             # All that the queue has dropped lies before the frame, which was behind it.
-            exact = self._exact = replace(frame.losses, frames=self.frames, backlog=self.backlog)
+            exact = self.losses = replace(frame.losses, frames=self.frames, backlog=self.backlog)
         last = self._reported
         if (
             last is None
@@ -254,7 +248,6 @@ class Grabber:
                 missed = pace.trigger(camera)
                 grabbed = camera.grab(pace.wait_s())
             except RigError as error:
-                self.absent_since_ns = round(heard_s * NS_PER_S)
                 return str(error)
             if missed:
                 self._counts = replace(self._counts, triggers=self._counts.triggers + 1)
@@ -265,7 +258,6 @@ class Grabber:
                 self._take(camera, grabbed)
                 heard_s, silent_s = now_s, self._silent_s
             elif now_s - heard_s > silent_s:
-                self.absent_since_ns = round(heard_s * NS_PER_S)
                 # With a trigger, silence is usual; without one, the connection is made anew even if the device answers.
                 if not self._wanted.trigger or not _within(_ANSWER_S, camera.alive):
                     return f"the camera has delivered no frame for {now_s - heard_s:.1f} s"
@@ -294,16 +286,15 @@ class Grabber:
         self._counts = counts
         if grabbed.incomplete or grabbed.image is None:
             return
-        stamp_ns, fit, before_ns = self._stamper.take(grabbed.device_ticks, grabbed.arrival_ns - self._epoch_ns)
+        stamp_ns, fit, before_ns = self._stamper.take(grabbed.device_ticks, grabbed.arrival_ns)
         if fit is not None and before_ns is not None and self._wanted.trigger not in ("", SOFTWARE):
             due = round(seconds(stamp_ns - before_ns) * self._wanted.rate_hz)
             if due > step:
                 self._counts = counts = replace(counts, triggers=counts.triggers + due - step)
         at = self._ids.index, stamp_ns
         self._span = (self._span[0] if self._span[1] != (0, 0) else at), at
-        arrival_ns = grabbed.arrival_ns - self._epoch_ns
         losses = replace(counts, stamp_ns=stamp_ns, ids=self._ids.index + 1)
-        frame = Captured(grabbed.image, grabbed.bits, self._ids.index, stamp_ns, arrival_ns, fit, losses)
+        frame = Captured(grabbed.image, grabbed.bits, self._ids.index, stamp_ns, grabbed.arrival_ns, fit, losses)
         with self._filled:
             if len(self._queue) == self._length:
                 self._queue.popleft()
@@ -322,7 +313,7 @@ class Grabber:
                 info = camera.open()
             except RigError:
                 info = None  # still absent; `absent` says since when, and this says nothing else
-            if info is not None and _same(known, info):
+            if info is not None and _identity(known) == _identity(info):
                 self._note_connection(info)
                 self._counts = replace(self._counts, reconnections=self._counts.reconnections + 1)
                 return camera
@@ -409,20 +400,6 @@ class _Stamper:
             stamp_ns = max(stamp_ns, before_ns + 1)
         self._last_ns = stamp_ns
         return stamp_ns, fit, before_ns
-
-
-def _loss_counts(of: CameraLosses) -> tuple[int, ...]:
-    return (of.link, of.incomplete, of.driver, of.backlog, of.triggers, of.reconnections)
-
-
-def _same(known: CameraInfo, info: CameraInfo) -> bool:
-    return (known.model, known.serial, known.width_px, known.height_px, known.bits) == (
-        info.model,
-        info.serial,
-        info.width_px,
-        info.height_px,
-        info.bits,
-    )
 
 
 def _within(time_s: float, call: Callable[[], _T]) -> _T | None:

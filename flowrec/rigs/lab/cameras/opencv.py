@@ -44,7 +44,6 @@ class OpencvCamera:
         self._file = Path(source).is_file()
         if number is None and not self._file and "://" not in source:
             raise RigError(f"lab.device = {source!r}: no such file; opencv takes a number, a file or a URL")
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         # OpenCV and FFmpeg print their failures; they are told here.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -52,7 +52,7 @@ def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> C
     wanted = wanted_of(camera, lab)
     driver = CAMERAS[lab.camera].load()
     frames: list[Captured] = []
-    with Grabber(partial(driver.of, wanted), wanted, lab.queue_frames, time.monotonic_ns()) as grabber:
+    with Grabber(partial(driver.of, wanted), wanted, lab.queue_frames) as grabber:
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s + (0.0 if frames else 3.0):
             frame = grabber.next(0.1)

@@ -16,7 +16,7 @@ with warnings.catch_warnings():
 
 from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
-from flowrec.rigs.lab.cameras.features import Feature, Value, configure
+from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
 _BUFFERS = 32
 _EMULATOR = "BaslerCamEmu"
@@ -74,13 +74,11 @@ class PylonCamera:
         self._bits = settled.bits
         self.device.MaxNumBuffer.Value = _BUFFERS
         self.device.StartGrabbing(pylon.GrabStrategy_OneByOne)
-        gige = about.GetDeviceClass() == _GIGE
-        extended = features.value("GevGVSPExtendedIDMode") == "On"
         return replace(
             settled,
             model=f"{about.GetVendorName()} {about.GetModelName()}",
             serial=about.GetSerialNumber(),
-            id_bits=16 if gige and not extended else 64,
+            id_bits=features.id_bits(about.GetDeviceClass() == _GIGE),
             ticks_per_s=0.0 if self._emulated else float(features.value("GevTimestampTickFrequency") or _NS),
         )
 
@@ -128,19 +126,19 @@ class PylonCamera:
                 self.device.Close()
 
 
-class _PylonNodes:
+class _PylonNodes(Features):
     """The settings of a camera; see features.Features."""
 
     def __init__(self, nodes: Any) -> None:
         self._nodes = nodes
         self._names = frozenset(node.GetNode().GetName() for node in nodes.GetNodes())
 
-    def feature(self, name: str) -> Feature | None:
+    def feature(self, name: str) -> Feature:
         if name not in self._names:
-            return None
+            return ABSENT
         node = self._nodes.GetNode(name)
         if not genicam.IsAvailable(node):
-            return None
+            return ABSENT
         low, high, step = 0.0, 0.0, 0.0
         if hasattr(node, "GetMin"):
             low, high = node.GetMin(), node.GetMax()
@@ -148,11 +146,6 @@ class _PylonNodes:
         value = node.GetValue() if hasattr(node, "GetValue") and genicam.IsReadable(node) else None
         entries = tuple(node.GetSettableValues()) if hasattr(node, "GetSettableValues") else ()
         return Feature(value, low, high, step, entries, genicam.IsWritable(node))
-
-    def value(self, name: str) -> Value | None:
-        """Its value; None if the device does not have it."""
-        found = self.feature(name)
-        return found.value if found is not None else None
 
     def put(self, name: str, value: Value) -> None:
         try:
