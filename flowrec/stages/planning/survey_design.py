@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import FlowField, Observations, Route, nearest_pixels
-from flowrec.physics import Chip, Doubts, FlowUncertainty, Robot
+from flowrec.physics import Chip, FlowUncertainty, Robot
 
 METHOD = "survey"  # that the routes bear
 Floats = NDArray[np.float64]
@@ -233,18 +233,3 @@ def covariance_after(covariance: Floats, information: Floats) -> Floats:
     """(q, q) covariance after observations of an information (q, q), or (q + k, q + k) with doubts."""
     information = information[: len(covariance), : len(covariance)]
     return np.asarray(np.linalg.solve(np.eye(len(covariance)) + covariance @ information, covariance))
-
-
-def place_information(
-    uncertainty: FlowUncertainty, noise_um_s: float, chip: Chip, places_um: Floats
-) -> tuple[Need, list[Floats]]:
-    """The need of the whole map, and the information (q, q) of one observation in each of n places (n, 2).
-
-    Without a robot: what observations would be worth if they could be taken anywhere.
-    """
-    rows, columns = nearest_pixels(places_um / chip.um_per_px, chip.mask.shape)
-    pixel = (np.cumsum(chip.mask.ravel()) - 1)[rows * chip.mask.shape[1] + columns]
-    effect = replace(uncertainty, doubts=Doubts.none(0)).effect(pixel, np.zeros((len(pixel), 2)))
-    variance = noise_um_s**2 + uncertainty.error_um_s[pixel] ** 2
-    need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
-    return need, [effect[:, k] @ effect[:, k].T / variance[k] for k in range(len(pixel))]
