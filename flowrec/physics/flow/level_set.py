@@ -31,9 +31,9 @@ class LevelSet:
     staircase: bool  # the wall follows the edges of the pixels
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of subcells."""
-        return (self.level.shape[0] - 1) // 2, (self.level.shape[1] - 1) // 2
+    def T(self) -> LevelSet:  # noqa: N802 - as numpy's
+        """The walls with rows and columns exchanged."""
+        return LevelSet(self.level.T, self.staircase)
 
     def at_centres(self, k: int) -> NDArray[np.float32]:
         """Level (h, w) at the centres of pixels of k x k subcells, not beyond FARTHEST_PX."""

@@ -17,6 +17,7 @@ faces, which leaves the flow of second order.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from flowrec.physics.flow.centre_values import centre_operator
 from flowrec.physics.flow.contour_smoothing import Floats, Ints
 from flowrec.physics.flow.grid import INLET, OPEN, OUTLET, WALL, Faces, Grid
 from flowrec.physics.flow.level_set import LevelSet
+from flowrec.physics.flow.linear_solver import Factors, factorise
 from flowrec.physics.flow.wall_stencils import Profiles, line_profiles
 
 # A wall that is nearer than this, in cells, would make a face infinitely stiff.
@@ -36,10 +38,11 @@ NEAREST = 0.02
 LEAST_VOLUME = 0.25
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Momentum:
     """Sparse operators on the fluxes of the faces."""
 
+    grid: Grid
     viscous: Any  # A (faces, faces)
     volume: Floats  # (faces,) V: 1, or 1/2 at outlets, over the open fraction
     side_flux: Any  # (6 faces, faces) outward flux through the six sides of each control volume
@@ -61,6 +64,19 @@ class Momentum:
         by_flux = sp.diags_array(self.side_velocity @ flux) @ self.side_flux
         by_velocity = sp.diags_array(self.side_flux @ flux) @ self.side_velocity
         return gather @ (by_flux + by_velocity)
+
+    @cached_property
+    def poisson(self) -> tuple[Any, Factors]:
+        """Transposed gradient (cells, faces) of the free faces, and factors of the Laplacian; made when first used."""
+        free = np.ones(self.grid.faces)
+        for faces in (self.grid.u, self.grid.v):
+            free[faces.number[faces.kind == INLET]] = 0.0
+        gradient = sp.diags_array(free) @ self.gradient
+        laplacian = gradient.T @ gradient
+        if not any(opening.kind == "outlet" for opening in self.grid.openings):
+            # In a closed box the level of the pressure is free: that of the first cell is set to 0.
+            laplacian = laplacian + sp.coo_array(([1.0], ([0], [0])), shape=laplacian.shape)
+        return gradient.T.tocsr(), factorise(laplacian)
 
 
 @dataclass(slots=True)
@@ -122,14 +138,14 @@ def assemble(grid: Grid) -> Momentum:
     sliding = np.zeros((n, 4))
     upright = _add_component(operators, sliding[:, 2:], grid.u, grid.v, grid.number_p, grid.walls)
     # The balance of v is that of u with rows and columns exchanged.
-    transposed = LevelSet(grid.walls.level.T, grid.walls.staircase)
-    level = _add_component(operators, sliding[:, :2], grid.v.T, grid.u.T, grid.number_p.T, transposed)
+    level = _add_component(operators, sliding[:, :2], grid.v.T, grid.u.T, grid.number_p.T, grid.walls.T)
     volume, outlet = np.ones(n), np.zeros((n, len(grid.openings)))
     for index, opening in enumerate(grid.openings):
         if opening.kind == "outlet":
             outlet[opening.faces, index] = opening.inward
             volume[opening.faces] = 0.5
     return Momentum(
+        grid,
         _per_flux(operators.viscous.matrix(), fraction),
         volume / fraction,
         operators.side_flux.matrix(),

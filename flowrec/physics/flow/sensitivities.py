@@ -88,12 +88,8 @@ class Sensitivities:
         scales = self.scales
         drive = scales.drive + scales.drive_per_unit * offset[: self.openings]
         inertia = scales.inertia * float(np.exp(-offset[self.openings]))
-        friction = self._friction_change(offset)
-        if isinstance(self.equations, GeneralisedSystem):
-            law = offset[len(offset) - len(self.law_unknowns) :]
-            return self.equations.with_changes(friction, law).residual(flux, drive, inertia)
-        load = self.equations.residual(flux, drive, inertia)
-        return load + friction * scales.friction * (self.equations.momentum.volume * flux) if friction else load
+        law = offset[len(offset) - len(self.law_unknowns) :]
+        return self.equations.changed_residual(flux, drive, inertia, self._friction_change(offset), law)
 
     def pressure(self, offset: Floats, remainder: Remainder) -> Floats:
         """Pressure (n,) in Pa at the chip's own viscosity; at fixed parameters it is proportional to the viscosity."""
@@ -122,10 +118,7 @@ def sensitivities(
     push = [momentum.outlet * scales.drive_per_unit, scales.inertia * momentum.convection(flux)[:, None]]
     if friction:
         given.append(none)
-        if isinstance(equations, GeneralisedSystem):
-            push.append(-equations.force_by_friction(flux)[:, None])
-        else:
-            push.append(-scales.friction * (momentum.volume * flux)[:, None])
+        push.append(-equations.force_by_friction(flux)[:, None])
     if shapes:
         for opening in grid.openings:
             if opening.kind == "inlet":

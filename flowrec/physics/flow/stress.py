@@ -19,6 +19,7 @@ the fluid.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ LEAST_WEIGHT = 0.1
 Bools = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Stress:
     """Sparse operators on the fluxes of the faces: r stresses, m points with a viscosity, g gradients."""
 
@@ -51,6 +52,13 @@ class Stress:
     square: Any  # (m, g) gamma^2 = square @ gradients^2
     planar: int  # number of gradients that are not across the depth
     viscous: int  # number of stresses that are not the drag of the depth
+    curl: Any  # (faces, unknowns) fluxes of stream functions
+
+    @cached_property
+    def on_streams(self) -> tuple[Any, Any, Any]:
+        """Operators gather, strain and gradient on stream functions; made when first used."""
+        left, strain, gradient = self.curl.T @ self.gather, self.strain @ self.curl, self.gradient @ self.curl
+        return left.tocsr(), strain.tocsr(), gradient.tocsr()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,16 +76,16 @@ class _Component:
     corners: tuple[Ints, Ints]  # the points below and above
 
 
-def assemble(grid: Grid, momentum: Momentum, friction: Floats | None) -> Stress:
+def assemble(momentum: Momentum, curl: Any, friction: Floats | None) -> Stress:
     """Operators of a grid; `friction` (faces,) is the factor 12 h^2 / H^2 of a shallow chip, else None."""
+    grid = momentum.grid
     h, w = grid.fluid.shape
     cell = np.arange(h * w).reshape(h, w)
     corner = h * w + np.arange((h + 1) * (w + 1)).reshape(h + 1, w + 1)
     fraction = grid.open_fraction
     upright, level = momentum.profiles
     u = _component(grid.u, grid.walls, upright, cell, corner, fraction)
-    transposed = LevelSet(grid.walls.level.T, grid.walls.staircase)
-    v = _component(grid.v.T, transposed, level, cell.T, corner.T, fraction)
+    v = _component(grid.v.T, grid.walls.T, level, cell.T, corner.T, fraction)
     points = h * w + corner.size
     shear, wall, mixed = _corner_gradients(grid, u, v, points)
     square, gradient, planar = _shear_rate(grid, _cell_gradients(u, v, points), shear, wall, friction, fraction)
@@ -98,7 +106,7 @@ def assemble(grid: Grid, momentum: Momentum, friction: Floats | None) -> Stress:
         face = np.concatenate([face, balanced])
     gather = sp.csr_array((np.ones(len(face)), (face, np.arange(len(face)))), shape=(grid.faces, len(face)))
     used = np.unique(at.indices)  # no stress needs the others
-    return Stress(gather, strain, at[:, used], gradient, square[used], planar, viscous)
+    return Stress(gather, strain, at[:, used], gradient, square[used], planar, viscous, curl)
 
 
 def _component(

@@ -5,7 +5,7 @@ It is not a message: it follows from the recorded observations and is computed a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,10 +116,6 @@ class FlowUncertainty:
         """The expected relative error of the flow over the mask, as in `FlowField.error_share`."""
         speed = float(np.sqrt((self.mean_um_s**2).sum()))
         return float(np.sqrt((self.std_um_s**2).sum())) / max(speed, 1e-300)
-
-    def with_covariance(self, covariance: Floats) -> FlowUncertainty:
-        """A copy with another covariance (p + r, p + r) of the modes."""
-        return replace(self, covariance=covariance)
 
     def effect(self, pixels: NDArray[np.intp], own_um_s: Floats) -> Floats:
         """(p + r + k, m, 2) what a unit of each unknown, and each doubt, adds to the flow observed in m fluid pixels.
