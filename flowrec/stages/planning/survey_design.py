@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import FlowField, Observations, Route, nearest_pixels
 from flowrec.physics import Chip, FlowUncertainty, Robot
-
-METHOD = "survey"  # that the routes bear
-Floats = NDArray[np.float64]
+from flowrec.stages.planning.cost_rasters import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +192,7 @@ class Looks:
             (sums / np.sqrt(least + total)[:, None, None]).transpose(1, 0, 2).reshape(unknowns, -1)
             for sums, total in ((before + added, weights_after), (before, weights))
         ]
-        return np.asarray(scaled @ scaled.T - shared[0] @ shared[0].T + shared[1] @ shared[1].T)
+        return scaled @ scaled.T - shared[0] @ shared[0].T + shared[1] @ shared[1].T
 
     def _after(self, which: NDArray[np.intp], weight: Floats, effect: Floats) -> Looks:
         sums, weights = self.sums.copy(), self.weights.copy()
