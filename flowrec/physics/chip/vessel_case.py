@@ -11,14 +11,14 @@ import math
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from flowrec.core import ChipError, refuse_irregular
-from flowrec.physics.chip.chip import Chip, Opening, Side
+from flowrec.physics.chip.chip import Chip, Kind, Opening, Side
 from flowrec.physics.chip.openings import check_chip
 
 KEYS = ("mask", "px", "rho_assumed", "mu_assumed", "op_side", "op_a", "op_b", "op_type", "op_u_assumed", "op_p_assumed")
@@ -38,10 +38,8 @@ def read_vessel_case(path: Path) -> Chip:
     for side, first, last, kind, speed, pressure in zip(*(known[key] for key in KEYS[4:]), strict=True):
         if str(side) not in _SIDES or str(kind) not in ("inlet", "outlet"):
             raise ChipError(f"{path}: opening {side} {kind}; sides are W, E, S, N, types inlet and outlet")
-        if kind == "inlet":
-            openings.append(Opening(_SIDES[str(side)], int(first), int(last), "inlet", float(speed) * 1e6))
-        else:
-            openings.append(Opening(_SIDES[str(side)], int(first), int(last), "outlet", float(pressure)))
+        value = float(speed) * 1e6 if kind == "inlet" else float(pressure)
+        openings.append(Opening(_SIDES[str(side)], int(first), int(last), cast(Kind, str(kind)), value))
     chip = Chip(
         path.stem,
         mask,
