@@ -21,10 +21,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from flowrec.core import M_PER_UM
+from flowrec.physics.arrays import Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.fluid import ViscosityLaw
 from flowrec.physics.flow import stress as stresses
-from flowrec.physics.flow.contour_smoothing import Floats
+from flowrec.physics.flow.assembly import scaled_rows
 from flowrec.physics.flow.level_set import LevelSet
 from flowrec.physics.flow.linear_solver import Factors, compute_cached, factorise
 from flowrec.physics.flow.newton_solver import (
@@ -38,7 +39,7 @@ from flowrec.physics.flow.newton_solver import (
     newton_equations,
     system,
 )
-from flowrec.physics.flow.stress import Stress, scaled_rows
+from flowrec.physics.flow.stress import Stress
 
 # Least tolerance of the last relative step: at the slowest convergence with kept factors (KEEPING) it leaves an error
 # of 4e-6, far below that of the grid. With a tenth of it a power law of 0.5 does not converge on one network in five:
@@ -191,12 +192,12 @@ class GeneralisedSystem(Equations):
             if not np.isfinite(right).all():
                 return None, number, step
             if factors is not None:
-                change = mixing.mix(np.asarray(curl @ factors.solve(right)))
+                change = mixing.mix(curl @ factors.solve(right))
                 step = float(np.abs(change).max()) / speed
             if factors is None or not step <= KEEPING * last:
                 factors = factorise(self._matrix(flux, inertia, trust))
                 mixing = _Mixing()
-                change = mixing.mix(np.asarray(curl @ factors.solve(right)))
+                change = mixing.mix(curl @ factors.solve(right))
                 step = float(np.abs(change).max()) / speed
             grew += step > last
             if not np.isfinite(step) or step > RUNAWAY or grew > PATIENCE:
@@ -210,7 +211,7 @@ class GeneralisedSystem(Equations):
             flux = flux + change
             last = step
             if step <= tolerance:
-                return np.asarray(flux), number, step
+                return flux, number, step
         return None, max_iterations, step
 
     def _trust(self, flux: Floats, change: Floats) -> Floats:
@@ -235,7 +236,7 @@ class GeneralisedSystem(Equations):
         stress = self.stress
         slopes = stress.gradient @ flux
         weighted = self._weights * slopes
-        rate2 = np.asarray(stress.square @ (weighted * slopes))
+        rate2 = stress.square @ (weighted * slopes)
         value, slope = self.law.relative(rate2)
         if self.strength != 1.0:
             slope = self.strength * value ** (self.strength - 1.0) * slope
@@ -265,14 +266,10 @@ class GeneralisedSystem(Equations):
         """Matrix of the equations for stream functions, linearised around a flow."""
         curl = self.stream.curl
         matrix = self._viscous_jacobian(flux, trust, *self.stress.on_streams)
-        if inertia and self._inertial(flux, inertia):
+        convection = np.abs(inertia * self.momentum.convection(flux)).max()
+        if convection > NEGLIGIBLE * np.abs(self.viscous_force(flux)).max():
             matrix = matrix + inertia * (curl.T @ self.momentum.convection_jacobian(flux) @ curl)
         return matrix
-
-    def _inertial(self, flux: Floats, inertia: float) -> bool:
-        """True if convection is large enough to matter for convergence."""
-        convection = np.abs(inertia * self.momentum.convection(flux)).max()
-        return bool(convection > NEGLIGIBLE * np.abs(self._viscous(self._viscosity(flux).value, flux)).max())
 
     def tangent(self, flux: Floats, inertia: float) -> tuple[Factors, Any]:
         """Factors and operator (faces, faces) of the equations linearised around a flow."""

@@ -14,14 +14,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from flowrec.core import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.physics.arrays import Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.flow import grid as grids
 from flowrec.physics.flow import momentum as momenta
 from flowrec.physics.flow import streamfunction as streams
-from flowrec.physics.flow.contour_smoothing import Floats
 from flowrec.physics.flow.grid import Grid
 from flowrec.physics.flow.level_set import LevelSet
-from flowrec.physics.flow.linear_solver import Factors, compute_cached, factorise, friction_key
+from flowrec.physics.flow.linear_solver import Factors, array_key, compute_cached, factorise
 from flowrec.physics.flow.momentum import Momentum
 from flowrec.physics.flow.streamfunction import StreamBasis
 
@@ -133,7 +133,7 @@ class Equations:
     def residual(self, flux: Floats, drive: Floats, inertia: float, push: Floats | float = 0.0) -> Floats:
         """(faces,) residual of the momentum equations without the inner pressure, which has to balance it; m/s."""
         convection = inertia * self.momentum.convection(flux)
-        return np.asarray(self.viscous_force(flux) + convection - (self.momentum.outlet @ drive + push))
+        return self.viscous_force(flux) + convection - (self.momentum.outlet @ drive + push)
 
     def unbalanced_fraction(self, flux: Floats, load: Floats) -> float:
         """Largest part of a load (faces,) that no pressure can balance, relative to the largest viscous term."""
@@ -148,7 +148,7 @@ class Equations:
     def pressure(self, load: Floats) -> Floats:
         """Cell values p h / mu (cells,) whose gradient balances a load (faces,); the pressure at outlets is zero."""
         divergence, factors = self.momentum.poisson
-        return np.asarray(factors.solve(divergence @ load))
+        return factors.solve(divergence @ load)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,7 @@ class System(Equations):
 
     def force_by_friction(self, flux: Floats) -> Floats:
         """(faces,) derivative of the viscous force with respect to ln of the depth friction."""
-        return np.asarray(self.friction * (self.momentum.volume * flux))
+        return self.friction * (self.momentum.volume * flux)
 
     def changed_residual(self, flux: Floats, drive: Floats, inertia: float, friction: float, law: Floats) -> Floats:
         """(faces,) `residual` with the depth friction times 1 + `friction`; the fluid has no law."""
@@ -215,11 +215,11 @@ class System(Equations):
         factors, last, step, grew = self.stokes, np.inf, np.inf, 0
         for number in range(1, max_iterations + 1):
             right = -(self.stream.curl.T @ self.residual(flux, drive, inertia, push))
-            change = np.asarray(self.stream.curl @ factors.solve(right))
+            change = self.stream.curl @ factors.solve(right)
             step = float(np.abs(change).max()) / speed
             if not np.isfinite(step) or step > WORTH_KEEPING * last or step > 0.5:
                 factors = self.tangent(flux, inertia)[0]
-                change = np.asarray(self.stream.curl @ factors.solve(right))
+                change = self.stream.curl @ factors.solve(right)
                 step = float(np.abs(change).max()) / speed
             grew += step > last
             if not np.isfinite(step) or step > RUNAWAY or grew > PATIENCE:
@@ -227,7 +227,7 @@ class System(Equations):
             flux = flux + change
             last = step
             if step <= tolerance:
-                return np.asarray(flux), number, step
+                return flux, number, step
         return None, max_iterations, step
 
     def tangent(self, flux: Floats, inertia: float) -> tuple[Factors, Any]:
@@ -240,8 +240,14 @@ class System(Equations):
 
 def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel, from the cache if they are there."""
-    key = ("system", *geometry_key(chip, k))
-    equations: System = compute_cached(key, lambda: _assemble(chip, k))
+
+    def compute() -> System:
+        # Friction of single pixels changes only the resistance of a chip without it.
+        if chip.friction_per_um2 is None:
+            return newton_equations(chip, k)
+        return with_friction(system(replace(chip, friction_per_um2=None), k), chip.friction_per_um2, chip.um_per_px)
+
+    equations: System = compute_cached(("system", *geometry_key(chip, k)), compute)
     return equations
 
 
@@ -249,14 +255,7 @@ def geometry_key(chip: Chip, k: int) -> tuple[Hashable, ...]:
     """All of a chip that the matrices depend on, as part of a cache key."""
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
     mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    return (*mask, openings, chip.walls, k, depth_friction(chip, k), friction_key(chip))
-
-
-def _assemble(chip: Chip, k: int) -> System:
-    """Assemble without the cache. Friction of single pixels changes only the resistance of a chip without it."""
-    if chip.friction_per_um2 is None:
-        return newton_equations(chip, k)
-    return with_friction(system(replace(chip, friction_per_um2=None), k), chip.friction_per_um2, chip.um_per_px)
+    return (*mask, openings, chip.walls, k, depth_friction(chip, k), array_key(chip.friction_per_um2))
 
 
 def with_friction(bare: System, friction_per_um2: Floats, um_per_px: float) -> System:

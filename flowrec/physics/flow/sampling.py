@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.core import FlowError, FlowField
+from flowrec.physics.arrays import Bools, Floats
 from flowrec.physics.flow.velocity_stencil import velocities_at, velocity_at
 
 _NO_WALLS = np.zeros((0, 0), np.float32)
 _NO_WALLS.flags.writeable = False
 
 
-def sample(field: FlowField, points_um: ArrayLike) -> NDArray[np.float64]:
+def sample(field: FlowField, points_um: ArrayLike) -> Floats:
     """Velocity (..., 2) in um/s at points (..., 2) in um; zero in solid and outside the mask's image.
 
     It follows the profile of the channel between pixel centres (velocity_stencil); a field that does not state its
@@ -46,7 +47,7 @@ class FieldError:
     v: float
 
 
-def relative_rmse(field: FlowField, truth: FlowField, mask: NDArray[np.bool_]) -> FieldError:
+def relative_rmse(field: FlowField, truth: FlowField, mask: Bools) -> FieldError:
     """sqrt(sum |v - v*|^2 / sum |v*|^2) at the centres of the fluid pixels of a mask (h, w): Table I of the paper.
 
     Both sums are over points, so both fields must hold values at pixel centres. A true field at rest gives NaN.
@@ -64,14 +65,14 @@ def relative_rmse(field: FlowField, truth: FlowField, mask: NDArray[np.bool_]) -
     error = (field.velocity_um_s - truth.velocity_um_s)[mask].astype(np.float64)
     true = truth.velocity_um_s[mask].astype(np.float64)
 
-    def ratio(error: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    def ratio(error: Floats, true: Floats) -> float:
         total = float((true**2).sum())
         return float(np.sqrt((error**2).sum() / total)) if total > 0 else float("nan")
 
     return FieldError(ratio(error[:, 0], true[:, 0]), ratio(error[:, 1], true[:, 1]), ratio(error, true))
 
 
-def fluid_image(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[Any]:
+def fluid_image(mask: Bools, values: NDArray[Any]) -> NDArray[Any]:
     """Values (n, ...) of the fluid pixels in raster order as an image (h, w, ...) that is 0 in solid."""
     image = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
     image[mask] = values

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flowrec.physics.arrays import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Registration:
 
     def on_chip(self, measured_um: Floats) -> Floats:
         """(n, 2) places on the chip of measured places (n, 2)."""
-        return np.asarray(self.centre_um + self.offset_um + (measured_um - self.centre_um) @ self._turn.T)
+        return self.centre_um + self.offset_um + (measured_um - self.centre_um) @ self._turn.T
 
     @property
     def matrix(self) -> Floats:
@@ -66,7 +66,7 @@ class Registration:
     def to_measured(self, on_chip_um: Floats) -> Floats:
         """(n, 2) where places (n, 2) on the chip are measured."""
         away = on_chip_um - self.centre_um - self.offset_um
-        return np.asarray(self.centre_um + np.linalg.solve(self._turn, away.T).T)
+        return self.centre_um + np.linalg.solve(self._turn, away.T).T
 
     @property
     def _turn(self) -> Floats:
