@@ -1,4 +1,4 @@
-"""What a vessel case (*.npz) holds beside its chip: observations of a robot, and the truth that it is judged by."""
+"""Contents of a vessel case (*.npz) beside its chip: observations of a robot, and the truth that it is judged by."""
 
 from __future__ import annotations
 

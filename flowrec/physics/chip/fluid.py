@@ -277,7 +277,7 @@ def law_of(settings: ViscositySettings, where: str) -> ViscosityLaw | None:
     ChipError
         In one line, for settings that are not of the law, or of which no flow can be computed.
     """
-    given = _given(settings)
+    given = _given_values(settings)
     name = given.pop("law", "newtonian")
     row = LAWS[name]
     for key in given:
@@ -302,14 +302,14 @@ def law_of(settings: ViscositySettings, where: str) -> ViscosityLaw | None:
 
 def with_settings(law: ViscosityLaw | None, settings: ViscositySettings, where: str) -> ViscosityLaw | None:
     """A chip's own law with the settings that are given instead; raises ChipError as `law_of` does."""
-    given = _given(settings)
+    given = _given_values(settings)
     if not given:
         return law
     own = law_settings(law) if settings.law is None else {}
     return law_of(ViscositySettings(**(own | given)), where)
 
 
-def _given(settings: ViscositySettings) -> dict[str, Any]:
+def _given_values(settings: ViscositySettings) -> dict[str, Any]:
     return {field.name: value for field in fields(settings) if (value := getattr(settings, field.name)) is not None}
 
 

@@ -102,7 +102,7 @@ class Grid:
     def _pixel_sums(self, cells: Floats | Bools) -> Floats:
         """Sums over the cells (h k, w k) of each pixel (h, w)."""
         h, w = self.mask.shape
-        return cells.reshape(h, self.k, w, self.k).astype(np.float64).sum(axis=(1, 3))
+        return np.asarray(cells.reshape(h, self.k, w, self.k).astype(np.float64).sum(axis=(1, 3)))
 
 
 def _parabola(low: Floats, high: Floats) -> Floats:

@@ -84,7 +84,7 @@ class _Entry:
         self.key, self.result = key, result
         self.sizes, self.growing = held_bytes([key, result])
 
-    def held(self) -> dict[int, int]:
+    def part_sizes(self) -> dict[int, int]:
         """Bytes of each part by its identity.
 
         A result grows where a part of it is made when it is first used: then one of its dictionaries or lists is
@@ -114,7 +114,7 @@ def compute_cached(key: Hashable, compute: Callable[[], Any]) -> Any:
         _entries.move_to_end(key)
         held: dict[int, int] = {}
         for number, entry in enumerate(reversed(list(_entries.values()))):  # the latest first
-            held |= entry.held()
+            held |= entry.part_sizes()
             if sum(held.values()) > LARGEST_BYTES and number >= FEWEST_ENTRIES:
                 del _entries[entry.key]
     return result

@@ -60,7 +60,7 @@ class Downstream(SurveyWays):
             )
         central = central_among(allowed.reshape(space.free.shape), space.clearance)
         end = _most_work(work, central.ravel())
-        route = self.timed(space, order.field, backtrack(parent, end, space.width), start, speed_um_s)
+        route = self.timed_stretch(space, order.field, backtrack(parent, end, space.width), start, speed_um_s)
         return with_remarks(route, start.remark) if route.reachable else route
 
 

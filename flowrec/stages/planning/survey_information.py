@@ -47,7 +47,7 @@ class _Stretch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Site:
-    """Where a stretch begins, and from where the goal can be reached."""
+    """The place where a stretch begins, and those from where the goal can be reached."""
 
     space: FreeSpace
     order: SurveyOrder
@@ -120,7 +120,7 @@ class Information(SurveyWays):
         if best is None:
             said = f"{ENOUGH}: the flow is known to {100.0 * now:.1f} %, and no further stretch is worth its time"
             return _so_far(order.present, said)
-        route = self.timed(site.space, believed, best.path, site.start, best.speed_um_s)
+        route = self.timed_stretch(site.space, believed, best.path, site.start, best.speed_um_s)
         if not route.reachable:
             return route
         said = f"from {100.0 * now:.1f} % to {100.0 * best.error:.1f} % of the flow in {route.arrival_s[-1]:.1f} s"

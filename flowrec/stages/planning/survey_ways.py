@@ -1,4 +1,4 @@
-"""What all surveys share: candidate places in the middle of the channels, the ways to them, and their routes."""
+"""Ways of all surveys: candidate places in the middle of the channels, paths to them, and their routes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,9 @@ class SurveyWays:
             far &= distance_px(opening, x, y, chip.mask.shape) >= self.outlet_gap_radii * space.radius
         return far
 
-    def timed(self, space: FreeSpace, field: FlowField, path: Points, start: Endpoint, speed_um_s: float) -> Route:
+    def timed_stretch(
+        self, space: FreeSpace, field: FlowField, path: Points, start: Endpoint, speed_um_s: float
+    ) -> Route:
         """The timed route along a path (n, 2) px of nodes, off the pixels where that is possible."""
         px = space.um_per_px
         path = with_ends(space, path, start, None)
