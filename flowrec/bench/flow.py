@@ -19,6 +19,7 @@ import typer
 
 from flowrec.bench.figure_flow import FlowPanels, draw, median_case
 from flowrec.bench.harness import Cases, FigureFile, Names, Results, choose_names, print_rows, vessel_cases
+from flowrec.bench.vessel_truth import read_observations, read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
 from flowrec.core import (
     FlowError,
@@ -31,14 +32,7 @@ from flowrec.core import (
     replacing,
     say,
 )
-from flowrec.physics import (
-    FlowSolver,
-    clear_cache,
-    read_observations,
-    read_true_velocity,
-    read_vessel_case,
-    relative_rmse,
-)
+from flowrec.physics import FlowSolver, clear_cache, read_vessel_case, relative_rmse
 from flowrec.stages import REFINERS, PiUnet, Refiner, Trimmed, with_row
 
 RANDOM_CASES = 10

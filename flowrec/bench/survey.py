@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from flowrec.bench.flow import make_up
 from flowrec.bench.harness import Cases, Names, Results, choose_names, print_rows, vessel_cases
+from flowrec.bench.vessel_truth import NOISES, read_observations, read_true_velocity
 from flowrec.bench.vessels import thin
-from flowrec.core import FlowError, FlowField, Observations, Route, progress, say
-from flowrec.physics import NOISES, FlowSolver, read_observations, read_true_velocity, relative_rmse, sample
+from flowrec.core import FlowError, FlowField, Observations, Route, nearest_pixels, progress, say
+from flowrec.physics import Chip, Doubts, FlowSolver, FlowUncertainty, relative_rmse, sample
 from flowrec.stages import (
+    Need,
     Refiner,
     ResolvedConfig,
     Sampling,
@@ -30,7 +32,6 @@ from flowrec.stages import (
     SurveyPlanner,
     covariance_after,
     load_config,
-    place_information,
     resolve,
 )
 
@@ -99,6 +100,21 @@ def _best(task: SurveyCase, places: Points) -> Points:
         covariance = covariance_after(covariance, each[best])
         taken.append(best)
     return places[taken]
+
+
+def place_information(
+    uncertainty: FlowUncertainty, noise_um_s: float, chip: Chip, places_um: Points
+) -> tuple[Need, list[Points]]:
+    """The need of the whole map, and the information (q, q) of one observation in each of n places (n, 2).
+
+    Without a robot: what observations would be worth if they could be taken anywhere.
+    """
+    rows, columns = nearest_pixels(places_um / chip.um_per_px, chip.mask.shape)
+    pixel = (np.cumsum(chip.mask.ravel()) - 1)[rows * chip.mask.shape[1] + columns]
+    effect = replace(uncertainty, doubts=Doubts.none(0)).effect(pixel, np.zeros((len(pixel), 2)))
+    variance = noise_um_s**2 + uncertainty.error_um_s[pixel] ** 2
+    need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
+    return need, [effect[:, k] @ effect[:, k].T / variance[k] for k in range(len(pixel))]
 
 
 def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Seen:

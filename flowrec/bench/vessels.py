@@ -16,10 +16,9 @@ from scipy import sparse
 from scipy.ndimage import binary_dilation, binary_erosion, label
 from scipy.sparse.csgraph import dijkstra
 
+from flowrec.bench.vessel_truth import NOISES, SHARES
 from flowrec.core import FlowrecError
 from flowrec.physics import (
-    NOISES,
-    SHARES,
     Chip,
     FlowSolver,
     Opening,

@@ -49,8 +49,7 @@ from .planning.replanning import better_route as better_route, route_elsewhere a
 from .planning.route import no_route as no_route, travel_time as travel_time
 from .planning.survey import SurveyPlanner as SurveyPlanner
 from .planning.survey_design import (
-    Sampling as Sampling, SurveyOrder as SurveyOrder, covariance_after as covariance_after,
-    place_information as place_information,
+    Need as Need, Sampling as Sampling, SurveyOrder as SurveyOrder, covariance_after as covariance_after,
 )
 from .refine.case import Case as Case
 from .refine.findings import scale_doubt as scale_doubt

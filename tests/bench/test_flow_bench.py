@@ -9,8 +9,9 @@ from flowrec.bench import figure_flow, flow
 from flowrec.bench.figure_flow import FlowPanels, draw, median_case
 from flowrec.bench.flow import make_up
 from flowrec.bench.harness import need_matplotlib
+from flowrec.bench.vessel_truth import read_observations
 from flowrec.core.errors import ChipError, UsageError
-from flowrec.physics.chip.vessel_case import read_observations, read_vessel_case
+from flowrec.physics.chip.vessel_case import read_vessel_case
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.refine import Pinn, Refiner
 

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.bench.vessel_truth import NOISES, SHARES, read_true_velocity
 from flowrec.bench.vessels import MASK_ERRORS, draw_mask, make_case, with_mask_error
 from flowrec.core import FlowField, FlowrecError, Observations, UsageError, replacing
-from flowrec.physics import NOISES, SHARES, Chip, FlowSolver, read_true_velocity, read_vessel_case
+from flowrec.physics import Chip, FlowSolver, read_vessel_case
 from flowrec.stages import ObservationOperator, observation_operator
 
 _MASK_ERROR_PROBABILITY = 0.15

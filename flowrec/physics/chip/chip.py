@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flowrec.core import Range, Seed
+from flowrec.physics.arrays import Bools, Floats
 from flowrec.physics.chip.fluid import ViscosityLaw, ViscositySettings
 
 Side = Literal["left", "right", "top", "bottom"]
@@ -59,7 +60,7 @@ class Chip:
     """Mask and assumed boundary values, from which flow, planning and simulation start."""
 
     name: str
-    mask: NDArray[np.bool_]  # (h, w) True in fluid
+    mask: Bools  # (h, w) True in fluid
     um_per_px: float
     openings: tuple[Opening, ...]
     viscosity_mpa_s: float
@@ -67,7 +68,7 @@ class Chip:
     depth_um: float | None = None  # None: two-dimensional; else depth-averaged friction -12 mu v / depth^2
     walls: Walls = "smooth"
     # (h, w) friction of each pixel beside that of the depth, as 12 / depth^2: the force is -mu times this times v
-    friction_per_um2: NDArray[np.float64] | None = None
+    friction_per_um2: Floats | None = None
     law: ViscosityLaw | None = None  # viscosity over viscosity_mpa_s as a function of shear rate; None: Newtonian
 
     @property
@@ -76,7 +77,7 @@ class Chip:
         return self.mask.shape[1] * self.um_per_px, self.mask.shape[0] * self.um_per_px
 
     @property
-    def boundary_values(self) -> NDArray[np.float64]:
+    def boundary_values(self) -> Floats:
         """(openings,) inlets: mean inward speed, um/s; outlets: pressure, Pa."""
         return np.array([opening.value for opening in self.openings], np.float64)
 

@@ -10,6 +10,7 @@ import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.core import ChipError
+from flowrec.physics.arrays import Bools, Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.openings import border, named_opening
 
@@ -17,7 +18,7 @@ _KEPT = 8  # masks of which the distances are kept: an assimilation asks for tho
 _PAD_PX = 16  # by which a channel goes on straight beyond the border
 
 
-def clearance_um(mask: NDArray[np.bool_], um_per_px: float) -> NDArray[np.float32]:
+def clearance_um(mask: Bools, um_per_px: float) -> NDArray[np.float32]:
     """Signed distance (h, w) in um from each pixel centre to the nearest wall, negative in solid.
 
     The wall lies half way between the centres of a fluid and a solid pixel: exact for walls along the pixels, up to
@@ -29,14 +30,14 @@ def clearance_um(mask: NDArray[np.bool_], um_per_px: float) -> NDArray[np.float3
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def _signed_px(shape: tuple[int, int], data: bytes) -> NDArray[np.float64]:
+def _signed_px(shape: tuple[int, int], data: bytes) -> Floats:
     """(h, w) the same in px, of the mask whose bytes are these."""
     padded = np.pad(np.frombuffer(data, np.bool_).reshape(shape), _PAD_PX, mode="edge")
     signed = np.where(padded, _distance(padded) - 0.5, 0.5 - _distance(~padded))
-    return np.asarray(signed[_PAD_PX:-_PAD_PX, _PAD_PX:-_PAD_PX])
+    return signed[_PAD_PX:-_PAD_PX, _PAD_PX:-_PAD_PX]
 
 
-def _distance(inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _distance(inside: Bools) -> Floats:
     """Distance (h, w) in px of each pixel to the nearest one outside; 0 there.
 
     OpenCV takes a tenth of SciPy's time, in single precision. Squared distances are whole numbers, so rounding them
@@ -75,7 +76,7 @@ def opening_point_um(chip: Chip, name: str, depth_um: float) -> tuple[float, flo
     return float(column * chip.um_per_px), float(row * chip.um_per_px)
 
 
-def nearest_fluid(chip: Chip, point_um: ArrayLike, clearance: float = 0.0) -> NDArray[np.float64] | None:
+def nearest_fluid(chip: Chip, point_um: ArrayLike, clearance: float = 0.0) -> Floats | None:
     """The pixel centre (2,) um nearest to a point with at least this clearance in um; None if there is none."""
     rows, columns = np.nonzero(chip.mask & (clearance_um(chip.mask, chip.um_per_px) >= clearance))
     if not len(rows):

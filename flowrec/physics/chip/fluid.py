@@ -17,17 +17,14 @@ neither the function nor its version.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import ChipError, Method, Methods, Range, faults
-
-Floats = NDArray[np.float64]
+from flowrec.physics.arrays import Floats
 
 LEAST_EXPONENT = 0.05  # that an unknown exponent can reach
 RATES_1_S = tuple(float(rate) for rate in np.logspace(-4, 6, 121).round(10))  # at which a user's function is read
@@ -113,7 +110,7 @@ class PowerLaw:
 
     def by_unknowns(self, rate2: Floats) -> Floats:
         by_exponent = 0.5 * np.log((rate2 + self.plateau_1_s**2) / self.rate_1_s**2)
-        return np.asarray((self.relative(rate2)[0] * by_exponent)[None])
+        return (self.relative(rate2)[0] * by_exponent)[None]
 
     def with_offset(self, offset: Floats) -> PowerLaw:
         return replace(self, exponent=max(self.exponent + float(offset[0]), LEAST_EXPONENT))
@@ -280,9 +277,8 @@ def law_of(settings: ViscositySettings, where: str) -> ViscosityLaw | None:
     ChipError
         In one line, for settings that are not of the law, or of which no flow can be computed.
     """
-    given = {field.name: getattr(settings, field.name) for field in fields(settings) if field.name != "law"}
-    given = {key: value for key, value in given.items() if value is not None}
-    name = settings.law or "newtonian"
+    given = _given_values(settings)
+    name = given.pop("law", "newtonian")
     row = LAWS[name]
     for key in given:
         if key not in row.options:
@@ -306,12 +302,15 @@ def law_of(settings: ViscositySettings, where: str) -> ViscosityLaw | None:
 
 def with_settings(law: ViscosityLaw | None, settings: ViscositySettings, where: str) -> ViscosityLaw | None:
     """A chip's own law with the settings that are given instead; raises ChipError as `law_of` does."""
-    given = {field.name: value for field in fields(settings) if (value := getattr(settings, field.name)) is not None}
+    given = _given_values(settings)
     if not given:
         return law
     own = law_settings(law) if settings.law is None else {}
-    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
-    return law_of(ViscositySettings(**(values | given)), where)
+    return law_of(ViscositySettings(**(own | given)), where)
+
+
+def _given_values(settings: ViscositySettings) -> dict[str, Any]:
+    return {field.name: value for field in fields(settings) if (value := getattr(settings, field.name)) is not None}
 
 
 def law_settings(law: ViscosityLaw | None) -> dict[str, Any]:
@@ -319,19 +318,15 @@ def law_settings(law: ViscosityLaw | None) -> dict[str, Any]:
     if law is None:
         return {}
     name = next(name for name, row in LAWS.items() if row.load() is type(law))
-    values = {field.name: getattr(law, field.name) for field in fields(law)}  # type: ignore[arg-type]
-    return {"law": name} | {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+    return {"law": name} | {field.name: getattr(law, field.name) for field in fields(law)}  # type: ignore[arg-type]
 
 
 def law_text(law: ViscosityLaw | None) -> str:
     """The law in words, for a field and its people: "power_law exponent=0.5 ...", '' for a Newtonian fluid."""
-    values: Mapping[str, Any] = law_settings(law)
-    parts = [
-        f"{key}={value!r}" if not isinstance(value, list) else f"{len(value)} {key}"
-        for key, value in values.items()
-        if key != "law"
-    ]
-    return " ".join([str(values.get("law", "")), *parts])
+    values = law_settings(law)
+    name = values.pop("law", "")
+    parts = [f"{len(value)} {key}" if isinstance(value, tuple) else f"{key}={value!r}" for key, value in values.items()]
+    return " ".join([name, *parts])
 
 
 def _check_table(table: TabulatedLaw, where: str) -> None:

@@ -37,10 +37,9 @@ from typing import Any, cast, get_args
 import cv2
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
-from numpy.typing import NDArray
 
 from flowrec.core import ChipError, hints, parse_toml, refuse_irregular
-from flowrec.movies import MovieNotes
+from flowrec.physics.arrays import Bools
 from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings, Kind, Opening, Side, Walls
 from flowrec.physics.chip.fluid import (
     BLOOD_KG_M3,
@@ -53,6 +52,7 @@ from flowrec.physics.chip.fluid import (
     with_settings,
 )
 from flowrec.physics.chip.openings import (
+    CHIP_NUMBERS,
     DEFAULT_INLET_UM_S,
     border,
     check_chip,
@@ -84,7 +84,7 @@ _OF_BLOOD = {"viscosity_mpa_s": BLOOD_MPA_S, "density_kg_m3": BLOOD_KG_M3}  # wh
 _OPENING_KEYS = ("side", "first", "last", "kind", "speed_um_s", "pressure_pa")
 
 
-def load_chip(settings: ChipSettings, mask: NDArray[np.bool_] | None = None) -> Chip:
+def load_chip(settings: ChipSettings, mask: Bools | None = None) -> Chip:
     """The chip that the settings name, or with that mask (h, w), with the values that they give instead of its own.
 
     Raises ChipError, in one line, if no flow can be computed on it.
@@ -104,11 +104,7 @@ def load_chip(settings: ChipSettings, mask: NDArray[np.bool_] | None = None) -> 
         raise ChipError(
             f"no built-in chip {settings.name!r}, did you mean {near!r}? A chip of your own is given by chip.path"
         )
-    given = {
-        key: value
-        for key in ("um_per_px", "walls", "viscosity_mpa_s", "density_kg_m3", "depth_um")
-        if (value := getattr(settings, key)) is not None
-    }
+    given = {key: value for key in (*CHIP_NUMBERS, "walls") if (value := getattr(settings, key)) is not None}
     law = with_settings(chip.law, settings.viscosity, where)
     of_blood = _OF_BLOOD if settings.viscosity.law == "blood" else {}
     chip = replace(chip, law=law, **(of_blood | given))
@@ -127,14 +123,9 @@ def chip_files(chip: Chip) -> tuple[bytes, str]:
     written, png = cv2.imencode(".png", np.where(chip.mask, 255, 0).astype(np.uint8))
     if not written:
         raise ChipError(f"{chip.name}: the mask can not be written as PNG; is it {chip.mask.shape} pixels?")
-    lines = [
-        f"name = {json.dumps(chip.name, ensure_ascii=False)}",
-        f"um_per_px = {float(chip.um_per_px)!r}",
-        f"viscosity_mpa_s = {float(chip.viscosity_mpa_s)!r}",
-        f"density_kg_m3 = {float(chip.density_kg_m3)!r}",
-    ]
-    if chip.depth_um is not None:
-        lines.append(f"depth_um = {float(chip.depth_um)!r}")
+    numbers = {key: getattr(chip, key) for key in CHIP_NUMBERS}
+    lines = [f"name = {json.dumps(chip.name, ensure_ascii=False)}"]
+    lines += [f"{key} = {float(value)!r}" for key, value in numbers.items() if value is not None]
     lines += [f'walls = "{chip.walls}"', 'fluid = "bright"']
     law = law_settings(chip.law)
     if law:
@@ -198,8 +189,13 @@ def _read_chip(path: Path, um_per_px: float | None) -> Chip:
     kind = path.suffix.lower()
     if kind == ".npz":
         return read_vessel_case(path)
-    if kind in _MOVIES and (notes := _movie_notes(path)) is not None:
-        return chip_from_files(*notes.chip_files(), str(path), um_per_px)
+    if kind in _MOVIES:
+        from flowrec.movies import open_movie  # with packages of an extra
+
+        with open_movie(path) as movie:
+            notes = movie.facts.notes  # None if another program made it
+        if notes is not None:
+            return chip_from_files(*notes.chip_files(), str(path), um_per_px)
     if kind not in (".png", ".toml"):
         raise ChipError(
             f"{path}: a chip is a .png with a .toml beside it, or a vessel case .npz; convert it to one of these"
@@ -219,15 +215,7 @@ def _read_chip(path: Path, um_per_px: float | None) -> Chip:
     return chip_from_files(data, text, str(path), um_per_px)
 
 
-def _movie_notes(path: Path) -> MovieNotes | None:
-    """Notes that flowrec wrote into a movie of a session; None if another program made it."""
-    from flowrec.movies import open_movie  # with packages of an extra
-
-    with open_movie(path) as movie:
-        return movie.facts.notes
-
-
-def _mask(png_bytes: bytes, fluid: str, where: str) -> NDArray[np.bool_]:
+def _mask(png_bytes: bytes, fluid: str, where: str) -> Bools:
     grey = None
     if png_bytes.startswith(_PNG_HEAD) and len(png_bytes) >= len(_PNG_HEAD) + 8:
         # The size in the header is checked before the image is decoded: a small file could demand gigabytes.
@@ -270,15 +258,10 @@ def _law(table: Any, where: str) -> tuple[ViscosityLaw | None, dict[str, float]]
     known = hints(ViscositySettings)
     _refuse_unknown(table, tuple(known), where)
     for key, value in table.items():
-        if key in ("law", "function"):
-            valid = isinstance(value, str)
-        else:
-            numbers = value if key in ("rates_1_s", "ratios") and isinstance(value, list) else [value]
-            valid = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in numbers)
-        if not valid:
-            raise ChipError(
-                f"{where}: viscosity.{key} = {value!r} is no {'text' if key in ('law', 'function') else 'number'}"
-            )
+        text = key in ("law", "function")
+        parts = value if key in ("rates_1_s", "ratios") and isinstance(value, list) else [value]
+        if not all(isinstance(part, str if text else (int, float)) and not isinstance(part, bool) for part in parts):
+            raise ChipError(f"{where}: viscosity.{key} = {value!r} is no {'text' if text else 'number'}")
     _choice(table, "law", tuple(LAWS), where)
     values: dict[str, Any] = {
         key: tuple(map(float, value)) if isinstance(value, list) else value for key, value in table.items()

@@ -20,9 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.core import ChipError
+from flowrec.physics.arrays import Bools, Floats
 from flowrec.physics.chip.chip import Chip, Kind, Opening, Side
 
 SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
+CHIP_NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um")  # of a chip; the depth may be None
 MIN_SIDE_PX, MIN_OPENING_PX = 8, 3
 DEFAULT_INLET_UM_S = 200.0
 
@@ -33,13 +35,13 @@ def border(image: NDArray[Any], side: Side) -> NDArray[Any]:
     return line
 
 
-def fluid_runs(line: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def fluid_runs(line: Bools) -> list[tuple[int, int]]:
     """First and last pixel of each run of fluid along a side."""
     steps = np.diff(np.concatenate(([0], line.astype(np.int8), [0])))
     return list(zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True))
 
 
-def run_around(line: NDArray[np.bool_], middle: int) -> tuple[int, int] | None:
+def run_around(line: Bools, middle: int) -> tuple[int, int] | None:
     """First and last pixel of the run of fluid around a pixel of a side; None if that is solid."""
     return next(((first, last) for first, last in fluid_runs(line) if first <= middle <= last), None)
 
@@ -51,7 +53,7 @@ def _end_pixels(opening: Opening, shape: tuple[int, ...]) -> set[tuple[int, int]
     return {(end, far) if opening.side in ("left", "right") else (far, end) for end in ends}
 
 
-def find_openings(mask: NDArray[np.bool_]) -> tuple[Opening, ...]:
+def find_openings(mask: Bools) -> tuple[Opening, ...]:
     """Every opening of a mask, all as outlets at 0 Pa."""
     found = [
         Opening(side, first, last, "outlet", 0.0)
@@ -95,13 +97,10 @@ def name_inlets(openings: tuple[Opening, ...], inlets: Iterable[str], where: str
             raise ChipError(f"{where}: no opening {wanted!r}; it has {', '.join(names)}. Did you mean {near!r}?")
         chosen |= fitting
     kinds: list[Kind] = ["inlet" if name in chosen else "outlet" for name in names]
-    return tuple(map(_as_kind, openings, kinds))
-
-
-def _as_kind(opening: Opening, kind: Kind) -> Opening:
-    """The opening as an inlet or an outlet, with the default value unless it is of that kind already."""
-    value = DEFAULT_INLET_UM_S if kind == "inlet" else 0.0
-    return opening if opening.kind == kind else replace(opening, kind=kind, value=value)
+    return tuple(
+        o if o.kind == kind else replace(o, kind=kind, value=DEFAULT_INLET_UM_S if kind == "inlet" else 0.0)
+        for o, kind in zip(openings, kinds, strict=True)
+    )
 
 
 def named_opening(chip: Chip, name: str) -> Opening:
@@ -132,14 +131,14 @@ def check_chip(chip: Chip, where: str) -> None:
             f'{where}: no wall in the mask; is it the other way round? (fluid = "dark" in its TOML) A field without '
             "walls, such as a dish, needs two far ones: make the first and the last row of pixels black"
         )
-    for key in ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um"):
+    for key in CHIP_NUMBERS:
         value = getattr(chip, key)
         if value is not None and not (math.isfinite(value) and value > 0):
             raise ChipError(f"{where}: {key} = {value:g}; it must be more than zero")
     check_openings(chip.mask, chip.openings, where)
 
 
-def check_openings(mask: NDArray[np.bool_], openings: tuple[Opening, ...], where: str) -> None:
+def check_openings(mask: Bools, openings: tuple[Opening, ...], where: str) -> None:
     """Raise ChipError unless the openings lie on fluid, apart from each other, with an inlet and an outlet."""
     for opening in openings:
         what = f"opening {opening.side} {opening.first}-{opening.last}"
@@ -174,7 +173,7 @@ def set_inlet_speed(openings: tuple[Opening, ...], speed_um_s: float) -> tuple[O
     )
 
 
-def distance_px(opening: Opening, x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def distance_px(opening: Opening, x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """From points x, y (...) in px to the nearest place of an opening on the border of a mask of `shape` (h, w)."""
     h, w = shape[:2]
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)

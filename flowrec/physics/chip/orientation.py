@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from flowrec.physics.arrays import Floats
 from flowrec.physics.chip.registration import Calibration
 
 _NAMES = {
@@ -44,7 +45,7 @@ class Orientation:
         return _NAMES[self.turned_deg, self.mirrored]
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Floats:
         """(2, 2) of directions."""
         return Calibration(1.0, angle_deg=float(self.turned_deg), mirror=self.mirrored).axes
 
@@ -73,7 +74,7 @@ AS_STATED = Orientation(0, mirrored=False)
 ORIENTATIONS = tuple(Orientation(turned, mirrored) for mirrored in (False, True) for turned in (0, 90, 180, 270))
 
 
-def likeness(matrix: ArrayLike) -> NDArray[np.float64]:
+def likeness(matrix: ArrayLike) -> Floats:
     """(8,) how much of each of ORIENTATIONS is in a matrix (2, 2): tr(D^T M) / 2, for D itself 1."""
     m = np.asarray(matrix, np.float64)
     return np.array([0.5 * float((each.matrix * m).sum()) for each in ORIENTATIONS])

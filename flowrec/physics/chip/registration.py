@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from flowrec.physics.arrays import Floats
 
 # Cosine and sine by angle in degrees.
 _EXACT = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 
 
-def on_chip(registration: NDArray[np.float64] | None, measured_um: ArrayLike) -> NDArray[np.float64]:
+def on_chip(registration: Floats | None, measured_um: ArrayLike) -> Floats:
     """Positions on the chip of measured ones (..., 2) in um, by the registration of a FlowField; None: as measured."""
     measured = np.asarray(measured_um, np.float64)
     if registration is None:
@@ -59,34 +61,34 @@ class Calibration:
         return cls(um_per_px, (x - (a * right + c * down), y - (b * right + d * down)), angle_deg, mirror)
 
     @property
-    def axes(self) -> NDArray[np.float64]:
+    def axes(self) -> Floats:
         """A (2, 2): its columns are the directions of the chip's axes in the image."""
         return np.array(_axes(self.angle_deg, self.mirror), np.float64)
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Floats:
         """(2, 3): chip coordinates in um of (column, row, 1)."""
         return np.column_stack((self.um_per_px * self.axes.T, self.origin_um))
 
     def for_shift(self, shift_px: tuple[float, float]) -> Calibration:
         """The transform for an image that lies `shift_px` (columns, rows) farther than this one is for."""
         x_um, y_um = self.to_um((-shift_px[0], -shift_px[1])).tolist()
-        return Calibration(self.um_per_px, (x_um, y_um), self.angle_deg, self.mirror)
+        return replace(self, origin_um=(x_um, y_um))
 
-    def to_um(self, points_px: ArrayLike) -> NDArray[np.float64]:
+    def to_um(self, points_px: ArrayLike) -> Floats:
         """Camera pixels (..., 2) as (column, row) to chip coordinates (..., 2) in um."""
         turned = self._rotate(np.asarray(points_px, np.float64), back=True)
         return turned * self.um_per_px + np.asarray(self.origin_um, np.float64)
 
-    def to_px(self, points_um: ArrayLike) -> NDArray[np.float64]:
+    def to_px(self, points_um: ArrayLike) -> Floats:
         """Chip coordinates (..., 2) in um to camera pixels (..., 2) as (column, row)."""
         return self.vectors_to_px(np.asarray(points_um, np.float64) - np.asarray(self.origin_um, np.float64))
 
-    def vectors_to_px(self, vectors_um: ArrayLike) -> NDArray[np.float64]:
+    def vectors_to_px(self, vectors_um: ArrayLike) -> Floats:
         """Differences (..., 2) of chip points in um to differences of camera pixels (..., 2)."""
         return self._rotate(np.asarray(vectors_um, np.float64), back=False) / self.um_per_px
 
-    def _rotate(self, vectors: NDArray[np.float64], *, back: bool) -> NDArray[np.float64]:
+    def _rotate(self, vectors: Floats, *, back: bool) -> Floats:
         """Directions (..., 2) on the chip to those in the image, or back."""
         if self.angle_deg == 0.0 and not self.mirror:
             return vectors

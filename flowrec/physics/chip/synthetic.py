@@ -14,11 +14,12 @@ import math
 
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from flowrec.core import ChipError
+from flowrec.physics.arrays import Bools, Floats
 from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip
 from flowrec.physics.chip.openings import find_openings, guess_inlets, set_inlet_speed
 
@@ -27,10 +28,9 @@ _HEIGHT, _WIDTH = 256, 320  # of the vessels
 _ROWS, _COLUMNS = 3, 4  # of their junctions
 _PEAK_UM_S = 400.0  # in the fastest branch, by the resistance network; bends and junctions add to it
 _Edge = tuple[int, int]
-_Points = NDArray[np.float64]
 
 
-def smooth_curve(points: ArrayLike, steps: int = 24) -> _Points:
+def smooth_curve(points: ArrayLike, steps: int = 24) -> Floats:
     """A Catmull-Rom curve (n, 2) through points (m, 2), with `steps` points from one to the next."""
     given = np.asarray(points, np.float64)
     p = np.concatenate((2 * given[:1] - given[1:2], given, 2 * given[-1:] - given[-2:-1]))
@@ -42,7 +42,7 @@ def smooth_curve(points: ArrayLike, steps: int = 24) -> _Points:
     return np.concatenate((*pieces, given[-1:]))
 
 
-def draw_channel(gap: _Points, curve: _Points, width: float) -> None:
+def draw_channel(gap: Floats, curve: Floats, width: float) -> None:
     """Lower `gap` (h, w), the distance of pixel centres to the nearest channel (negative inside), to this channel's.
 
     Curve (n, 2) and width in pixels. Only pixels within the channel and a little around it are touched.
@@ -138,7 +138,7 @@ def _attempt(rng: np.random.Generator, name: str) -> Chip | None:
     return _chip(name, mask, inlet_speed)
 
 
-def _junctions(rng: np.random.Generator) -> _Points:
+def _junctions(rng: np.random.Generator) -> Floats:
     """(rows * columns, 2) points in pixels."""
     x = np.linspace(0.2, 0.8, _COLUMNS) * _WIDTH
     y = np.linspace(0.2, 0.8, _ROWS) * _HEIGHT
@@ -184,7 +184,7 @@ def _chains(edges: list[_Edge], count: int) -> list[list[int]]:
     return chains
 
 
-def _wander(rng: np.random.Generator, corners: _Points) -> _Points:
+def _wander(rng: np.random.Generator, corners: Floats) -> Floats:
     """A smooth curve through points (n, 2) that bends to either side between them, as real vessels do."""
     points = [corners[0]]
     for a, b in itertools.pairwise(corners):
@@ -195,7 +195,7 @@ def _wander(rng: np.random.Generator, corners: _Points) -> _Points:
     return smooth_curve(points, 16)
 
 
-def _as_drawn(mask: NDArray[np.bool_], loops: int, fourth_side: str) -> bool:
+def _as_drawn(mask: Bools, loops: int, fourth_side: str) -> bool:
     """True if the mask has one piece, the openings and the islands that were drawn: no channels have merged."""
     if [opening.side for opening in find_openings(mask)] != ["left", "right", "right", fourth_side]:
         return False
@@ -208,7 +208,7 @@ def _as_drawn(mask: NDArray[np.bool_], loops: int, fourth_side: str) -> bool:
     return bool(pieces == 1 and len(islands) == loops and (sizes > 150).all())
 
 
-def _inlet_speed(ends: list[_Edge], curves: list[_Points], widths: list[float], inlet: int) -> float | None:
+def _inlet_speed(ends: list[_Edge], curves: list[Floats], widths: list[float], inlet: int) -> float | None:
     """Mean inlet speed in um/s at which the fastest branch peaks at the wanted speed; None if a branch has no flow.
 
     Plane Poiseuille flow in each branch, q = w^3 dp / (12 mu L), as a network: G p = q, with p = 0 at the outlets,
@@ -229,7 +229,7 @@ def _inlet_speed(ends: list[_Edge], curves: list[_Points], widths: list[float], 
     return round(_PEAK_UM_S / float(of_inlet * peak.max()), 1)
 
 
-def _chip(name: str, mask: NDArray[np.bool_], inlet_speed_um_s: float) -> Chip:
+def _chip(name: str, mask: Bools, inlet_speed_um_s: float) -> Chip:
     """A chip of water with the default openings; the mask becomes read-only."""
     mask.flags.writeable = False
     openings = set_inlet_speed(guess_inlets(find_openings(mask)), inlet_speed_um_s)

@@ -12,17 +12,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from flowrec.physics.flow.contour_smoothing import Floats, Ints
-from flowrec.physics.flow.grid import WALL, Faces, Grid
+from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.physics.flow.assembly import Triplets
+from flowrec.physics.flow.grid import WALL, Faces, Grid, number_where
 from flowrec.physics.flow.wall_stencils import Profiles
 
 # A wall that is nearer than this to a face, in cells, would make its weight large.
 NEAREST = 0.05
-
-_Entries = tuple[Ints, Ints, Floats]  # pixels (m,), faces (m, columns), weights per velocity of a face (m, columns)
 
 
 def centre_operator(grid: Grid, upright: Profiles, level: Profiles) -> Any:
@@ -30,54 +27,43 @@ def centre_operator(grid: Grid, upright: Profiles, level: Profiles) -> Any:
 
     `upright` are the profiles of the u faces, `level` those of the v faces with rows and columns exchanged.
     """
-    number = np.full(grid.mask.shape, -1, np.int64)
-    number[grid.mask] = np.arange(np.count_nonzero(grid.mask))
-    walls = grid.walls.level
-    parts = []
-    for axis, part in enumerate(
-        (
-            _component(grid.u, upright, walls, grid.k, number),
-            _component(grid.v.T, level, walls.T, grid.k, number.T),
-        )
+    number, count = number_where(grid.mask, 0)
+    entries = Triplets((2 * count, grid.faces))
+    for axis, faces, profiles, walls, pixels in (
+        (0, grid.u, upright, grid.walls.level, number),
+        (1, grid.v.T, level, grid.walls.level.T, number.T),
     ):
-        for pixels, columns, values in part:
-            rows = np.broadcast_to(2 * pixels[:, None] + axis, columns.shape)
-            known = columns >= 0
-            parts.append((rows[known], columns[known], values[known]))
-    rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return sp.csr_array((values, (rows, columns)), shape=(2 * int(number.max(initial=-1) + 1), grid.faces))
+        row, column = np.nonzero(pixels >= 0)
+        place = row * grid.k + grid.k // 2, column * grid.k + grid.k // 2
+        out = 2 * pixels[row, column, None] + axis
+        if grid.k % 2 == 0:
+            _add_at_corners(entries, out, faces, profiles, *place)
+        else:
+            _add_at_cells(entries, out, faces, profiles, walls, *place)
+    return entries.matrix()
 
 
-def _component(faces: Faces, profiles: Profiles, walls: Floats, k: int, number: Ints) -> list[_Entries]:
-    """Entries of the velocity that flows through upright faces."""
-    row, column = np.nonzero(number >= 0)
-    pixels, j, i = number[row, column], row * k + k // 2, column * k + k // 2
-    if k % 2 == 0:
-        return _at_corners(faces, profiles, pixels, j, i)
-    return _at_cells(faces, profiles, walls, pixels, j, i)
-
-
-def _at_corners(faces: Faces, profiles: Profiles, pixels: Ints, j: Ints, i: Ints) -> list[_Entries]:
-    """Mean of the parabolas of the faces above and below the corner (j, i) of cells."""
+def _add_at_corners(entries: Triplets, out: Ints, faces: Faces, profiles: Profiles, j: Ints, i: Ints) -> None:
+    """Add the mean of the parabolas of the faces above and below the corner (j, i) of cells to rows `out` (m, 1)."""
     ends = [(j - 1, 0.5), (j, -0.5)]
     open_ = [faces.kind[above, i] != WALL for above, _ in ends]
     count = np.maximum(open_[0].astype(np.int64) + open_[1], 1)
-    found = []
     for here, (above, t) in zip(open_, ends, strict=True):
         rows = profiles.place[above, i][here]
         values = profiles.value(rows, np.full(len(rows), t)) / count[here, None]
-        found.append((pixels[here], profiles.columns[rows], values))
-    return found
+        entries.add(out[here], profiles.columns[rows], values)
 
 
-def _at_cells(faces: Faces, profiles: Profiles, walls: Floats, pixels: Ints, j: Ints, i: Ints) -> list[_Entries]:
-    """Interpolation along the row from the faces on both sides of the centre of cell (j, i), or from walls."""
+def _add_at_cells(
+    entries: Triplets, out: Ints, faces: Faces, profiles: Profiles, walls: Floats, j: Ints, i: Ints
+) -> None:
+    """Add the interpolation along the row from the faces on both sides of the centre of cell (j, i), or from walls."""
     w = faces.kind.shape[1] - 1
     line = 2 * j + 1
     # Place along the row, face there or -1 at a wall, and whether it is a node.
     at: list[Floats] = []
     face: list[Ints] = []
-    used: list[NDArray[np.bool_]] = []
+    used: list[Bools] = []
     for step in (-1, 1):
         near = i + (step > 0)
         beyond = np.clip(near + step, 0, w)
@@ -92,7 +78,6 @@ def _at_cells(faces: Faces, profiles: Profiles, walls: Floats, pixels: Ints, j: 
         at += [step * np.where(open_near, 0.5, wall), step * np.maximum(behind, 0.5 + NEAREST)]
         face += [np.where(open_near, near, -1), np.where(open_near & inside & open_beyond, beyond, -1)]
         used += [np.ones(len(i), bool), open_near & inside]
-    found: list[_Entries] = []
     for node in range(4):
         weight = np.ones(len(i))
         for other in range(4):
@@ -102,10 +87,9 @@ def _at_cells(faces: Faces, profiles: Profiles, walls: Floats, pixels: Ints, j: 
         open_ = face[node] >= 0
         rows = profiles.place[j[open_], face[node][open_]]
         values = profiles.value(rows, np.zeros(len(rows))) * weight[open_, None]
-        found.append((pixels[open_], profiles.columns[rows], values))
-    return found
+        entries.add(out[open_], profiles.columns[rows], values)
 
 
 def _crossing(fluid: Floats, solid: Floats) -> Floats:
     """Fraction, 0 to 1, of the way from a point in fluid to one in solid at which the level set is zero."""
-    return np.asarray(np.clip(fluid / np.maximum(fluid - solid, 1e-12), 0.0, 1.0))
+    return np.clip(fluid / np.maximum(fluid - solid, 1e-12), 0.0, 1.0)

@@ -18,13 +18,9 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
-from scipy.sparse.csgraph import connected_components
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from flowrec.physics.arrays import Bools, Floats, Ints
 
 STIFFNESS_PX = 8.0  # l of a wall that stays in its gates: wobbles shorter than about 2 pi l come from the mask's steps
 SOFTENING = 16.0  # divides l^6 around gates that the curve misses
@@ -49,10 +45,10 @@ class Gates:
     middle: Floats  # (n, 2) x, y in pixels; (0, 0) is the centre of the first pixel
     inward: Floats  # (n, 2) unit vector from solid to fluid
     wall: Ints  # (n,) number of the wall, ascending
-    closed: NDArray[np.bool_]  # (walls,) whether the wall returns to its first gate; else it ends at the image's border
+    closed: Bools  # (walls,) whether the wall returns to its first gate; else it ends at the image's border
 
 
-def find_gates(mask: NDArray[np.bool_]) -> Gates:
+def find_gates(mask: Bools) -> Gates:
     """Gates of a mask. Fluid pixels that touch at corners only are not connected."""
     h, w = mask.shape
     down, across = mask[1:], mask[:, 1:]
@@ -80,36 +76,31 @@ def find_gates(mask: NDArray[np.bool_]) -> Gates:
     return Gates((begin_xy + 0.5 * STEP[way])[order], inward[order], wall, closed)
 
 
-def _order_edges(after: Ints) -> tuple[Ints, Ints, NDArray[np.bool_]]:
+def _order_edges(after: Ints) -> tuple[Ints, Ints, Bools]:
     """Order of the edges along their walls, the number of the wall of each, and which walls are closed.
 
-    `after` (n,) is the edge that follows each edge, -1 at the image's border.
+    `after` (n,) is the edge that follows each edge, -1 at the image's border. A closed wall begins at its first edge.
     """
-    n = len(after)
-    if n == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool)
-    edge = np.arange(n)
-    linked = after >= 0
-    count, wall = connected_components(
-        sp.coo_array((np.ones(linked.sum(), bool), (edge[linked], after[linked])), shape=(n, n)), directed=False
-    )
-    closed = np.ones(count, bool)
-    closed[wall[~linked]] = False
-    # A closed wall begins at its first edge: cut the link back to it.
-    _, first = np.unique(wall, return_index=True)
-    follow = np.where(linked, after, edge)
-    cut = closed[wall] & (follow == first[wall])
-    follow[cut] = edge[cut]
-    # Number of steps to the end of the wall, by pointer doubling.
-    left, jump = (follow != edge).astype(np.int64), follow
-    while (jump[jump] != jump).any():
-        left = left + left[jump]
-        jump = jump[jump]
-    order = np.lexsort((-left, wall))
-    return order, wall[order].astype(np.int64), closed
+    before = np.full_like(after, -1)
+    before[after[after >= 0]] = np.flatnonzero(after >= 0)
+    following, preceding = after.tolist(), before.tolist()
+    order: dict[int, int] = {}  # number of the wall by edge
+    closed: list[bool] = []
+    for first in range(len(after)):
+        if first in order:
+            continue
+        edge = first
+        while preceding[edge] not in (-1, first):
+            edge = preceding[edge]
+        closed.append(preceding[edge] == first)
+        edge = first if closed[-1] else edge
+        while edge >= 0 and edge not in order:
+            order[edge] = len(closed) - 1
+            edge = following[edge]
+    return np.array([*order], np.int64), np.array([*order.values()], np.int64), np.array(closed, np.bool_)
 
 
-def contour_segments(mask: NDArray[np.bool_], per_gate: int) -> tuple[Floats, Floats]:
+def contour_segments(mask: Bools, per_gate: int) -> tuple[Floats, Floats]:
     """Straight segments of the contour: begins and ends (n, 2), x, y in pixels, with the fluid on their right.
 
     The curve from one gate to the next is divided into `per_gate` segments. Walls that end at the image's border are
@@ -166,7 +157,7 @@ def _cubic(point: Floats, before: Ints, after: Ints, per_gate: int) -> tuple[Flo
     u = np.linspace(0.0, 1.0, per_gate + 1)[:, None, None]
     swing = u * (1.0 - u) * sa * ((1.0 - u) * tangent - u * tangent[after])
     straight = u * u * (3.0 - 2.0 * u) * ahead
-    return np.asarray(point + straight + swing), tangent
+    return point + straight + swing, tangent
 
 
 def _smoothest(crossed: Gates) -> Floats:
@@ -245,7 +236,7 @@ def _relax(middle: Floats, inward: Floats, wall: Ints, stiffness: Floats) -> Flo
 
 def _unit(vector: Floats) -> Floats:
     """Vectors (n, 2) scaled to length 1, or 0 where they vanish."""
-    return np.asarray(vector / np.maximum(np.hypot(vector[:, 0], vector[:, 1]), 1e-9)[:, None])
+    return vector / np.maximum(np.hypot(vector[:, 0], vector[:, 1]), 1e-9)[:, None]
 
 
 def _across(vector: Floats) -> Floats:

@@ -21,27 +21,25 @@ import numpy as np
 import scipy.sparse as sp
 
 from flowrec.core import M_PER_UM
+from flowrec.physics.arrays import Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.fluid import ViscosityLaw
-from flowrec.physics.flow import newton_solver
 from flowrec.physics.flow import stress as stresses
-from flowrec.physics.flow.contour_smoothing import Floats
-from flowrec.physics.flow.grid import Grid
+from flowrec.physics.flow.assembly import scaled_rows
 from flowrec.physics.flow.level_set import LevelSet
 from flowrec.physics.flow.linear_solver import Factors, compute_cached, factorise
-from flowrec.physics.flow.momentum import Momentum
 from flowrec.physics.flow.newton_solver import (
     PATIENCE,
     RUNAWAY,
     Continuation,
+    Equations,
     System,
-    depth_friction,
     geometry_key,
     local_friction,
+    newton_equations,
     system,
 )
-from flowrec.physics.flow.streamfunction import StreamBasis
-from flowrec.physics.flow.stress import Stress, scaled_rows
+from flowrec.physics.flow.stress import Stress
 
 # Least tolerance of the last relative step: at the slowest convergence with kept factors (KEEPING) it leaves an error
 # of 4e-6, far below that of the grid. With a tenth of it a power law of 0.5 does not converge on one network in five:
@@ -61,21 +59,6 @@ SMALL = 1e-5  # change of an unknown of the law for the derivative of its slit f
 NEGLIGIBLE = 0.01
 # Steps of the law's strength, from 0 (the Newtonian flow) to 1.
 BY_STRENGTH = Continuation(1e-2, 0.02, longer=1.5, shorter=0.4)
-
-
-@dataclass(frozen=True, eq=False)
-class StressOperators:
-    """Operators of one geometry, for all fluids."""
-
-    system: System
-    stress: Stress
-
-    @cached_property
-    def on_streams(self) -> tuple[Any, Any, Any]:
-        """Operators gather, strain and gradient on stream functions."""
-        curl, stress = self.system.stream.curl, self.stress
-        left, strain, gradient = curl.T @ stress.gather, stress.strain @ curl, stress.gradient @ curl
-        return left.tocsr(), strain.tocsr(), gradient.tocsr()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,64 +92,27 @@ class _Mixing:
 
 
 @dataclass(frozen=True, eq=False)
-class GeneralisedSystem:
-    """Equations of one fluid; the methods are those of `System`."""
+class GeneralisedSystem(Equations):
+    """The equations of a fluid with a law of viscosity."""
 
-    operators: StressOperators
+    newtonian: System  # of the same geometry
+    stress: Stress
     law: ViscosityLaw
     per_cell: float  # 1/s per m/s of difference between neighbouring cells
     drag: float = 1.0  # factor of the depth friction
     strength: float = 1.0  # power of the law: 0 is the Newtonian fluid
 
-    @property
-    def system(self) -> System:
-        """The Newtonian equations of the same geometry."""
-        return self.operators.system
+    def viscous_force(self, flux: Floats) -> Floats:
+        return self._viscous(self._viscosity(flux).value, flux)
 
-    @property
-    def grid(self) -> Grid:
-        """The grid."""
-        return self.system.grid
-
-    @property
-    def momentum(self) -> Momentum:
-        """Operators that do not depend on the fluid."""
-        return self.system.momentum
-
-    @property
-    def stream(self) -> StreamBasis:
-        """The divergence-free flows."""
-        return self.system.stream
+    def changed_residual(self, flux: Floats, drive: Floats, inertia: float, friction: float, law: Floats) -> Floats:
+        """`residual` with the depth friction times 1 + `friction` and `law` (P,) added to the law's unknowns."""
+        changed = self.law.with_offset(law) if len(law) else self.law
+        return replace(self, law=changed, drag=self.drag * (1.0 + friction)).residual(flux, drive, inertia)
 
     def linear(self, drives: Floats, push: Floats | float = 0.0) -> Floats:
         """Newtonian Stokes fluxes."""
-        return self.system.linear(drives, push)
-
-    def velocity(self, flux: Floats) -> Floats:
-        """Velocity (n, 2) at the centres of the fluid pixels in m/s, of fluxes (faces,)."""
-        return self.system.velocity(flux)
-
-    def pressure(self, load: Floats) -> Floats:
-        """Cell values p h / mu (cells,) whose gradient balances a load (faces,)."""
-        return self.system.pressure(load)
-
-    def unbalanced_fraction(self, flux: Floats, load: Floats) -> float:
-        """Largest part of a load (faces,) that no pressure can balance, relative to the largest viscous term."""
-        terms = np.abs(self.stream.curl).T @ np.abs(self._viscous(self._viscosity(flux).value, flux))
-        left = self.stream.curl.T @ load
-        return float(np.abs(left).max(initial=0.0) / max(float(terms.max(initial=0.0)), 1e-300))
-
-    def with_changes(self, friction: float, law: Floats) -> GeneralisedSystem:
-        """The equations with the depth friction times 1 + `friction` and `law` (P,) added to the law's unknowns."""
-        changed = self.law.with_offset(law) if len(law) else self.law
-        return replace(self, law=changed, drag=self.drag * (1.0 + friction))
-
-    def residual(self, flux: Floats, drive: Floats, inertia: float, push: Floats | float = 0.0) -> Floats:
-        """(faces,) residual of the momentum equations without the inner pressure, which has to balance it; m/s."""
-        force = self._viscous(self._viscosity(flux).value, flux)
-        if inertia:
-            force = force + inertia * self.momentum.convection(flux)
-        return np.asarray(force - (self.momentum.outlet @ drive + push))
+        return self.newtonian.linear(drives, push)
 
     def force_by_unknowns(self, flux: Floats) -> Floats:
         """(faces, P) derivatives of the viscous force with respect to the law's unknowns."""
@@ -184,7 +130,7 @@ class GeneralisedSystem:
 
     def force_by_friction(self, flux: Floats) -> Floats:
         """(faces,) derivative of the viscous force with respect to ln of the depth friction."""
-        stress, found = self.operators.stress, self._viscosity(flux)
+        stress, found = self.stress, self._viscosity(flux)
         drag = (stress.at @ found.value) * (stress.strain @ flux)
         drag[: stress.viscous] = 0.0
         by_rate = self._viscous(found.slope * self._across_depth(found, flux), flux)
@@ -192,7 +138,7 @@ class GeneralisedSystem:
 
     def _across_depth(self, found: _Viscosity, flux: Floats) -> Floats:
         """(m,) the part of gamma^2 that the depth adds."""
-        stress = self.operators.stress
+        stress = self.stress
         squares = found.weighted * (stress.gradient @ flux)
         squares[: stress.planar] = 0.0
         return np.asarray(stress.square @ squares)
@@ -246,12 +192,12 @@ class GeneralisedSystem:
             if not np.isfinite(right).all():
                 return None, number, step
             if factors is not None:
-                change = mixing.mix(np.asarray(curl @ factors.solve(right)))
+                change = mixing.mix(curl @ factors.solve(right))
                 step = float(np.abs(change).max()) / speed
             if factors is None or not step <= KEEPING * last:
                 factors = factorise(self._matrix(flux, inertia, trust))
                 mixing = _Mixing()
-                change = mixing.mix(np.asarray(curl @ factors.solve(right)))
+                change = mixing.mix(curl @ factors.solve(right))
                 step = float(np.abs(change).max()) / speed
             grew += step > last
             if not np.isfinite(step) or step > RUNAWAY or grew > PATIENCE:
@@ -265,12 +211,12 @@ class GeneralisedSystem:
             flux = flux + change
             last = step
             if step <= tolerance:
-                return np.asarray(flux), number, step
+                return flux, number, step
         return None, max_iterations, step
 
     def _trust(self, flux: Floats, change: Floats) -> Floats:
         """(m,) how far Newton's linearisation is trusted at each point, after a change of the flow."""
-        stress = self.operators.stress
+        stress = self.stress
         before, step = stress.gradient @ flux, stress.gradient @ change
         squares = np.stack([before**2, (before + step) ** 2, step**2], axis=1)
         squares = stress.square @ (self._weights[:, None] * squares)
@@ -280,17 +226,17 @@ class GeneralisedSystem:
     @cached_property
     def _weights(self) -> Floats:
         """(g,) of the squared gradients in gamma^2, 1/s^2 per (m/s)^2."""
-        stress = self.operators.stress
+        stress = self.stress
         weights = np.full(stress.gradient.shape[0], self.per_cell**2)
         # The rate across the depth is proportional to the root of the friction.
         weights[stress.planar :] *= self.law.slit_factor**2 * self.drag
         return weights
 
     def _viscosity(self, flux: Floats) -> _Viscosity:
-        stress = self.operators.stress
+        stress = self.stress
         slopes = stress.gradient @ flux
         weighted = self._weights * slopes
-        rate2 = np.asarray(stress.square @ (weighted * slopes))
+        rate2 = stress.square @ (weighted * slopes)
         value, slope = self.law.relative(rate2)
         if self.strength != 1.0:
             slope = self.strength * value ** (self.strength - 1.0) * slope
@@ -299,18 +245,18 @@ class GeneralisedSystem:
 
     def _viscous(self, viscosity: Floats, flux: Floats) -> Floats:
         """(faces,) viscous force and drag of viscosities (m,) on a flow."""
-        stress = self.operators.stress
+        stress = self.stress
         return np.asarray(stress.gather @ self._apply_drag((stress.at @ viscosity) * (stress.strain @ flux)))
 
     def _apply_drag(self, stress: Floats) -> Floats:
         """Stresses (r,) with the drag of the depth times its factor."""
         if self.drag != 1.0:
-            stress[self.operators.stress.viscous :] *= self.drag
+            stress[self.stress.viscous :] *= self.drag
         return stress
 
     def _viscous_jacobian(self, flux: Floats, trust: Floats | float, gather: Any, strain: Any, gradient: Any) -> Any:
         """Derivative of the viscous force, between the spaces of `gather` and of `strain` and `gradient`."""
-        stress, found = self.operators.stress, self._viscosity(flux)
+        stress, found = self.stress, self._viscosity(flux)
         by_velocity = gather @ scaled_rows(self._apply_drag(stress.at @ found.value), strain)
         by_viscosity = gather @ scaled_rows(self._apply_drag(stress.strain @ flux), stress.at)
         slopes = scaled_rows(2.0 * trust * found.slope, stress.square) @ scaled_rows(found.weighted, gradient)
@@ -319,19 +265,15 @@ class GeneralisedSystem:
     def _matrix(self, flux: Floats, inertia: float, trust: Floats | float) -> Any:
         """Matrix of the equations for stream functions, linearised around a flow."""
         curl = self.stream.curl
-        matrix = self._viscous_jacobian(flux, trust, *self.operators.on_streams)
-        if inertia and self._inertial(flux, inertia):
+        matrix = self._viscous_jacobian(flux, trust, *self.stress.on_streams)
+        convection = np.abs(inertia * self.momentum.convection(flux)).max()
+        if convection > NEGLIGIBLE * np.abs(self.viscous_force(flux)).max():
             matrix = matrix + inertia * (curl.T @ self.momentum.convection_jacobian(flux) @ curl)
         return matrix
 
-    def _inertial(self, flux: Floats, inertia: float) -> bool:
-        """True if convection is large enough to matter for convergence."""
-        convection = np.abs(inertia * self.momentum.convection(flux)).max()
-        return bool(convection > NEGLIGIBLE * np.abs(self._viscous(self._viscosity(flux).value, flux)).max())
-
     def tangent(self, flux: Floats, inertia: float) -> tuple[Factors, Any]:
         """Factors and operator (faces, faces) of the equations linearised around a flow."""
-        stress = self.operators.stress
+        stress = self.stress
         operator = self._viscous_jacobian(flux, 1.0, stress.gather, stress.strain, stress.gradient)
         if inertia:
             operator = operator + inertia * self.momentum.convection_jacobian(flux)
@@ -341,25 +283,26 @@ class GeneralisedSystem:
 
 def generalised_system(chip: Chip, law: ViscosityLaw, k: int) -> GeneralisedSystem:
     """The equations of a law on a chip's geometry, whose operators come from the cache if they are there."""
+    equations = system(chip, k)
     key: Hashable = ("stress", *geometry_key(chip, k))
-    operators: StressOperators = compute_cached(key, lambda: _operators(system(chip, k), chip))
-    return GeneralisedSystem(operators, law, _per_cell(chip, k))
+    return _with_law(equations, compute_cached(key, lambda: _stress(equations, chip)), chip, law)
 
 
 def generalised_equations(chip: Chip, law: ViscosityLaw, k: int, walls: LevelSet | None = None) -> GeneralisedSystem:
     """Assemble the equations without the cache. `walls` replaces the walls of the mask."""
-    operators = _operators(newton_solver.newton_equations(chip, k, walls), chip)
-    return GeneralisedSystem(operators, law, _per_cell(chip, k))
+    equations = newton_equations(chip, k, walls)
+    return _with_law(equations, _stress(equations, chip), chip, law)
 
 
-def _per_cell(chip: Chip, k: int) -> float:
-    return k / (chip.um_per_px * M_PER_UM)
+def _with_law(equations: System, stress: Stress, chip: Chip, law: ViscosityLaw) -> GeneralisedSystem:
+    per_cell = equations.grid.k / (chip.um_per_px * M_PER_UM)
+    return GeneralisedSystem(equations.momentum, equations.stream, equations, stress, law, per_cell)
 
 
-def _operators(equations: System, chip: Chip) -> StressOperators:
+def _stress(equations: System, chip: Chip) -> Stress:
     friction = None
     if chip.depth_um is not None or chip.friction_per_um2 is not None:
-        friction = np.full(equations.grid.faces, depth_friction(chip, equations.grid.k))
+        friction = np.full(equations.grid.faces, equations.friction)
         if chip.friction_per_um2 is not None:
             friction += local_friction(chip.friction_per_um2, chip.um_per_px, equations.grid)
-    return StressOperators(equations, stresses.assemble(equations.grid, equations.momentum, friction))
+    return stresses.assemble(equations.momentum, equations.stream.curl, friction)

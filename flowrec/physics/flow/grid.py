@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from flowrec.core import FlowError
+from flowrec.physics.arrays import Bools, Floats, Ints
 from flowrec.physics.chip.chip import Chip, Kind, Opening, Side
 from flowrec.physics.chip.openings import SIDES, border
-from flowrec.physics.flow.contour_smoothing import Floats, Ints
-from flowrec.physics.flow.level_set import LevelSet, from_mask
+from flowrec.physics.flow.assembly import components
+from flowrec.physics.flow.level_set import LevelSet, from_mask, subcells
 
 WALL, OPEN, OUTLET, INLET = range(4)  # kinds of a face
 
@@ -65,7 +64,7 @@ class Grid:
     """
 
     k: int
-    fluid: NDArray[np.bool_]  # (h, w) cells, whole or cut, that are connected to an opening
+    fluid: Bools  # (h, w) cells, whole or cut, that are connected to an opening
     u: Faces
     v: Faces
     number_p: Ints  # (h, w) numbers of the cells, -1 elsewhere
@@ -73,16 +72,16 @@ class Grid:
     cells: int
     openings: tuple[GridOpening, ...]
     walls: LevelSet
-    mask: NDArray[np.bool_]  # the chip's pixels
+    mask: Bools  # the chip's pixels
 
     @property
     def open_fraction(self) -> Floats:
         """(faces,) the part of each face that is fluid."""
-        fraction = np.empty(self.faces)
-        for faces in (self.u, self.v):
-            numbered = faces.number >= 0
-            fraction[faces.number[numbered]] = (faces.high - faces.low)[numbered]
-        return fraction
+        return self.on_faces(self.u.high - self.u.low, self.v.high - self.v.low)
+
+    def on_faces(self, upright: Floats, level: Floats) -> Floats:
+        """(faces,) of values of all upright (h, w + 1) and level (h + 1, w) faces, in the order of their numbers."""
+        return np.concatenate([upright[self.u.number >= 0], level[self.v.number >= 0]])
 
     @property
     def wall_px(self) -> NDArray[np.float32]:
@@ -91,26 +90,19 @@ class Grid:
 
     def pressure(self, cells: Floats) -> Floats:
         """Averages (h, w) over the fluid cells of each pixel of cell values (cells,): zero in solid."""
-        total = self._blocks(np.append(cells, 0.0)[self.number_p][..., None]).sum(axis=(1, 3))[..., 0]
-        count = self._blocks(self.fluid[..., None]).sum(axis=(1, 3))[..., 0]
+        total, count = (self._pixel_sums(values) for values in (np.append(cells, 0.0)[self.number_p], self.fluid))
         return np.asarray(total / np.maximum(count, 1) * self.mask)
 
     def face_means(self, pixels: Floats) -> Floats:
         """(faces,) means of the cells on both sides of each face, of values (h, w) of the pixels."""
-        cells = np.pad(np.repeat(np.repeat(pixels, self.k, axis=0), self.k, axis=1), 1, mode="edge")
-        means = np.empty(self.faces)
-        for faces, before, after in (
-            (self.u, cells[1:-1, :-1], cells[1:-1, 1:]),
-            (self.v, cells[:-1, 1:-1], cells[1:, 1:-1]),
-        ):
-            numbered = faces.number >= 0
-            means[faces.number[numbered]] = 0.5 * (before + after)[numbered]
-        return means
+        cells = np.pad(subcells(pixels, self.k), 1, mode="edge")
+        across, down = cells[1:-1], cells[:, 1:-1]
+        return self.on_faces(0.5 * (across[:, :-1] + across[:, 1:]), 0.5 * (down[:-1] + down[1:]))
 
-    def _blocks(self, cells: NDArray[np.generic]) -> Floats:
-        """(h k, w k, c) as (h, k, w, k, c)."""
-        h, w, channels = cells.shape
-        return cells.reshape(h // self.k, self.k, w // self.k, self.k, channels).astype(np.float64)
+    def _pixel_sums(self, cells: Floats | Bools) -> Floats:
+        """Sums over the cells (h k, w k) of each pixel (h, w)."""
+        h, w = self.mask.shape
+        return np.asarray(cells.reshape(h, self.k, w, self.k).astype(np.float64).sum(axis=(1, 3)))
 
 
 def _parabola(low: Floats, high: Floats) -> Floats:
@@ -130,14 +122,10 @@ def build(chip: Chip, k: int, walls: LevelSet | None = None) -> Grid:
     """
     walls = from_mask(chip.mask, k, chip.walls) if walls is None else walls
     level = walls.level
-    low_u, high_u = _fluid_part(level)
-    low_v, high_v = (end.T for end in _fluid_part(level.T))
-    open_u, open_v = high_u - low_u >= CLOSED, high_v - low_v >= CLOSED
     split = _split_cells(level)
-    open_u[:, 1:] &= ~split
-    open_u[:, :-1] &= ~split
-    open_v[1:] &= ~split
-    open_v[:-1] &= ~split
+    # Upright faces; the level ones are those with rows and columns exchanged.
+    (low_u, high_u, open_u), (low_v, high_v, open_v) = _fluid_part(level, split), _fluid_part(level.T, split.T)
+    low_v, high_v, open_v = low_v.T, high_v.T, open_v.T
     places = [
         _opening_faces(chip, level, open_u if opening.side in UPRIGHT else open_v, k, index)
         for index, opening in enumerate(chip.openings)
@@ -150,9 +138,9 @@ def build(chip: Chip, k: int, walls: LevelSet | None = None) -> Grid:
     fluid = _connected_cells(kind_u, kind_v)
     kind_u[:, 1:][~fluid], kind_u[:, :-1][~fluid] = WALL, WALL
     kind_v[1:][~fluid], kind_v[:-1][~fluid] = WALL, WALL
-    number_u, u_faces = _number_where(kind_u != WALL, 0)
-    number_v, faces = _number_where(kind_v != WALL, u_faces)
-    number_p, cells = _number_where(fluid, 0)
+    number_u, u_faces = number_where(kind_u != WALL, 0)
+    number_v, faces = number_where(kind_v != WALL, u_faces)
+    number_p, cells = number_where(fluid, 0)
     u, v = Faces(kind_u, number_u, low_u, high_u), Faces(kind_v, number_v, low_v, high_v)
     openings = tuple(
         _grid_opening(opening, u if opening.side in UPRIGHT else v, place, k)
@@ -178,15 +166,16 @@ def _grid_opening(opening: Opening, faces: Faces, place: tuple[Ints, Ints], k: i
     )
 
 
-def _fluid_part(level: Floats) -> tuple[Floats, Floats]:
-    """Begin and end (h, w + 1) of the fluid part of upright faces, 0 to 1; end <= begin where there is none.
+def _fluid_part(level: Floats, split_cells: Bools) -> tuple[Floats, Floats, Bools]:
+    """Begin and end (h, w + 1) of the fluid part of upright faces, 0 to 1, and which are open.
 
-    The level is linear between the ends of a face and its midpoint.
+    Where there is no fluid, end <= begin. No face of a cell in `split_cells` (h, w) is open. The level is linear
+    between the ends of a face and its midpoint.
     """
     first, middle, last = level[:-1:2, ::2], level[1::2, ::2], level[2::2, ::2]
 
     def crossing(solid: Floats, fluid: Floats) -> Floats:
-        return np.asarray(-solid / np.maximum(fluid - solid, 1e-12))
+        return -solid / np.maximum(fluid - solid, 1e-12)
 
     fluid_first, fluid, fluid_last = first > 0.0, middle > 0.0, last > 0.0
     low = np.where(fluid, 0.5 * crossing(first, middle), 0.5 + 0.5 * crossing(middle, last))
@@ -194,10 +183,14 @@ def _fluid_part(level: Floats) -> tuple[Floats, Floats]:
     low = np.where(fluid_first, 0.0, np.where(fluid | fluid_last, low, 1.0))
     high = np.where(fluid_last, 1.0, np.where(fluid | fluid_first, high, 0.0))
     split = fluid_first & fluid_last & ~fluid
-    return np.where(split, 0.5, low), np.where(split, 0.5, high)
+    low, high = np.where(split, 0.5, low), np.where(split, 0.5, high)
+    open_ = high - low >= CLOSED
+    open_[:, 1:] &= ~split_cells
+    open_[:, :-1] &= ~split_cells
+    return low, high, open_
 
 
-def _split_cells(level: Floats) -> NDArray[np.bool_]:
+def _split_cells(level: Floats) -> Bools:
     """Cells (h, w) with solid in the centre and separate fluid at their sides: nothing may pass through."""
     corner, upright, flat = level[::2, ::2] > 0.0, level[1::2, ::2] > 0.0, level[::2, 1::2] > 0.0
     ring = [corner[:-1, :-1], flat[:-1], corner[:-1, 1:], upright[:, 1:], corner[1:, 1:], flat[1:], corner[1:, :-1]]
@@ -206,7 +199,7 @@ def _split_cells(level: Floats) -> NDArray[np.bool_]:
     return np.asarray((level[1::2, 1::2] <= 0.0) & (changes > 2))
 
 
-def _number_where(where: NDArray[np.bool_], start: int) -> tuple[Ints, int]:
+def number_where(where: Bools, start: int) -> tuple[Ints, int]:
     """Consecutive numbers from `start` where true, -1 elsewhere, and the next free number."""
     count = int(np.count_nonzero(where))
     numbers = np.full(where.shape, -1, np.int64)
@@ -214,7 +207,7 @@ def _number_where(where: NDArray[np.bool_], start: int) -> tuple[Ints, int]:
     return numbers, start + count
 
 
-def _opening_faces(chip: Chip, level: Floats, open_: NDArray[np.bool_], k: int, index: int) -> tuple[Ints, Ints]:
+def _opening_faces(chip: Chip, level: Floats, open_: Bools, k: int, index: int) -> tuple[Ints, Ints]:
     """Rows and columns of the border faces of opening `index`: the run of open faces with most of its pixels."""
     opening = chip.openings[index]
     line, corner = border(open_, opening.side), border(level[::2, ::2], opening.side)
@@ -237,17 +230,14 @@ def _opening_faces(chip: Chip, level: Floats, open_: NDArray[np.bool_], k: int, 
     return rows, columns
 
 
-def _connected_cells(kind_u: NDArray[np.int8], kind_v: NDArray[np.int8]) -> NDArray[np.bool_]:
+def _connected_cells(kind_u: NDArray[np.int8], kind_v: NDArray[np.int8]) -> Bools:
     """Cells (h, w) connected to an opening: ponds have no flow and no defined pressure. In a closed box all cells."""
     h, w = kind_v.shape[0] - 1, kind_u.shape[1] - 1
     cell = np.arange(h * w).reshape(h, w)
     right, down = kind_u[:, 1:-1] != WALL, kind_v[1:-1] != WALL
     one = np.concatenate([cell[:, :-1][right], cell[:-1][down]])
     two = np.concatenate([cell[:, 1:][right], cell[1:][down]])
-    _, labels = connected_components(
-        sp.coo_array((np.ones(len(one), bool), (one, two)), shape=(h * w, h * w)), directed=False
-    )
-    labels = labels.reshape(h, w)
+    labels = components(one, two, cell.size).reshape(h, w)
     at_openings = np.concatenate(
         [border(labels, side)[border(kind_u if side in UPRIGHT else kind_v, side) != WALL] for side in SIDES]
     )

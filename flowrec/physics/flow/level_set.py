@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.physics.arrays import Bools, Floats, Ints
 from flowrec.physics.chip.chip import Walls
-from flowrec.physics.flow.contour_smoothing import Floats, Ints, contour_segments
+from flowrec.physics.flow.contour_smoothing import contour_segments
 
 SEGMENTS_PER_GATE = 2  # straight segments of the contour from one gate to the next
 REACH_PX = 0.7  # largest distance of the contour from the edges of the pixels
@@ -31,9 +33,9 @@ class LevelSet:
     staircase: bool  # the wall follows the edges of the pixels
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of subcells."""
-        return (self.level.shape[0] - 1) // 2, (self.level.shape[1] - 1) // 2
+    def T(self) -> LevelSet:  # noqa: N802 - as numpy's
+        """The walls with rows and columns exchanged."""
+        return LevelSet(self.level.T, self.staircase)
 
     def at_centres(self, k: int) -> NDArray[np.float32]:
         """Level (h, w) at the centres of pixels of k x k subcells, not beyond FARTHEST_PX."""
@@ -55,14 +57,19 @@ def from_distance(distance: Callable[[Floats, Floats], Floats], shape: tuple[int
     return LevelSet(np.asarray(distance(x, y), np.float64), staircase=False)
 
 
-def from_mask(mask: NDArray[np.bool_], k: int, walls: Walls) -> LevelSet:
+def from_mask(mask: Bools, k: int, walls: Walls) -> LevelSet:
     """Walls of a mask (h, w): `pixel` follows the edges of its pixels, `smooth` the smoothest contour it allows."""
     return _staircase(mask, k) if walls == "pixel" else _smooth(mask, k)
 
 
-def _staircase(mask: NDArray[np.bool_], k: int) -> LevelSet:
+def subcells(pixels: NDArray[Any], k: int) -> NDArray[Any]:
+    """(h k, w k) values of pixels (h, w) on k x k parts of each."""
+    return np.repeat(np.repeat(pixels, k, axis=0), k, axis=1)
+
+
+def _staircase(mask: Bools, k: int) -> LevelSet:
     """The edges of the pixels."""
-    fluid = np.repeat(np.repeat(mask, 2 * k, axis=0), 2 * k, axis=1)
+    fluid = subcells(mask, 2 * k)
     # A sample lies between four quarters of subcells: in fluid where all are fluid, on the wall where only some are.
     around = np.pad(fluid, 1, mode="edge")
     corners = [around[:-1, :-1], around[:-1, 1:], around[1:, :-1], around[1:, 1:]]
@@ -70,7 +77,7 @@ def _staircase(mask: NDArray[np.bool_], k: int) -> LevelSet:
     return LevelSet(level, staircase=True)
 
 
-def _smooth(mask: NDArray[np.bool_], k: int) -> LevelSet:
+def _smooth(mask: Bools, k: int) -> LevelSet:
     """Signed distance to the smoothed contour of the mask, computed in half subcells."""
     unit = 2 * k
     shape = (mask.shape[0] * unit + 1, mask.shape[1] * unit + 1)
@@ -85,7 +92,7 @@ def _smooth(mask: NDArray[np.bool_], k: int) -> LevelSet:
     ]
     # Far from the contour the pixel itself gives the sign.
     far = np.where(mask, reach, -reach)
-    level = np.pad(np.repeat(np.repeat(far, unit, axis=0), unit, axis=1), ((0, 1), (0, 1)), mode="edge")
+    level = np.pad(subcells(far, unit), ((0, 1), (0, 1)), mode="edge")
     if parts:
         sample, distance, side = (np.concatenate(part) for part in zip(*parts, strict=True))
         nearest, sign = np.full(level.size, reach), np.zeros(level.size)
@@ -120,7 +127,7 @@ def _distances(a: Floats, b: Floats, window: Ints, shape: tuple[int, int], reach
     return at[:, 1] * shape[1] + at[:, 0], np.sqrt(squared[segment, place]), side[segment, place]
 
 
-def _keep_topology(level: Floats, mask: NDArray[np.bool_], k: int) -> None:
+def _keep_topology(level: Floats, mask: Bools, k: int) -> None:
     """Restore the mask's topology: pixels keep their side, and neighbours stay connected or separate."""
     unit = 2 * k
     for lines, pixels in (
@@ -139,7 +146,7 @@ def _keep_topology(level: Floats, mask: NDArray[np.bool_], k: int) -> None:
     np.minimum(corner, 0.0, out=corner, where=diagonal)
 
 
-def _clamp(samples: Floats, fluid: NDArray[np.bool_], solid: NDArray[np.bool_], k: int) -> None:
+def _clamp(samples: Floats, fluid: Bools, solid: Bools, k: int) -> None:
     """Keep samples of known fluid and solid on their side of the wall."""
     np.maximum(samples, CLEARANCE_PX * 2 * k, out=samples, where=fluid)
     np.minimum(samples, -CLEARANCE_PX * 2 * k, out=samples, where=solid)

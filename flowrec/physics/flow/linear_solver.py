@@ -22,19 +22,17 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sized
 from dataclasses import fields, is_dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
 from flowrec.core import separate_large_blocks
+from flowrec.physics.arrays import Floats
 from flowrec.physics.chip.chip import Chip
-
-Floats = NDArray[np.float64]
 
 # An assimilation on a network holds 0.45 GB, a bifurcation 0.27 GB (five depths, k = 1).
 LARGEST_BYTES, FEWEST_ENTRIES = 700_000_000, 4
@@ -43,7 +41,6 @@ LARGEST_BYTES, FEWEST_ENTRIES = 700_000_000, 4
 # five chips (0.7 to 38 million numbers).
 _BYTES_PER_FACTOR = 11
 
-_entries: OrderedDict[Hashable, Any] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -80,6 +77,27 @@ def factorise(matrix: Any) -> Factors:
     return factors
 
 
+class _Entry:
+    """A cached result, and the bytes of the arrays, factors and byte strings that it and its key consist of."""
+
+    def __init__(self, key: Hashable, result: Any) -> None:
+        self.key, self.result = key, result
+        self.sizes, self.growing = held_bytes([key, result])
+
+    def part_sizes(self) -> dict[int, int]:
+        """Bytes of each part by its identity.
+
+        A result grows where a part of it is made when it is first used: then one of its dictionaries or lists is
+        longer than before, and all parts are measured again.
+        """
+        if any(len(part) != count for part, count in self.growing):
+            self.sizes, self.growing = held_bytes([self.key, self.result])
+        return self.sizes
+
+
+_entries: OrderedDict[Hashable, _Entry] = OrderedDict()
+
+
 def compute_cached(key: Hashable, compute: Callable[[], Any]) -> Any:
     """The result of `compute` for this key, from the cache if it is still there.
 
@@ -89,56 +107,49 @@ def compute_cached(key: Hashable, compute: Callable[[], Any]) -> Any:
     with _lock:
         if key in _entries:
             _entries.move_to_end(key)
-            return _entries[key]
+            return _entries[key].result
     result = compute()
     with _lock:
-        _entries[key] = result
+        _entries[key] = _Entry(key, result)
         _entries.move_to_end(key)
-        # All are measured again: a result grows where a part of it is made when it is first used.
-        counted: set[int] = set()
-        total = 0
-        for number, (used, entry) in enumerate(reversed(list(_entries.items()))):  # the latest first
-            total += held_bytes([used, entry], counted)
-            if total > LARGEST_BYTES and number >= FEWEST_ENTRIES:
-                del _entries[used]
+        held: dict[int, int] = {}
+        for number, entry in enumerate(reversed(list(_entries.values()))):  # the latest first
+            held |= entry.part_sizes()
+            if sum(held.values()) > LARGEST_BYTES and number >= FEWEST_ENTRIES:
+                del _entries[entry.key]
     return result
 
 
-def held_bytes(results: Iterable[Any], counted: set[int]) -> int:
-    """Bytes of the arrays, factors and byte strings in results and in all that they consist of.
-
-    `counted` has the identities of what was counted before; what is found now is added to it.
-    """
-    total, waiting = 0, list(results)
+def held_bytes(results: Iterable[Any]) -> tuple[dict[int, int], list[tuple[Sized, int]]]:
+    """Bytes, by identity, of all arrays, factors and byte strings in results; and what can grow, with its length."""
+    sizes: dict[int, int] = {}
+    growing: list[tuple[Sized, int]] = []
+    seen: set[int] = set()
+    waiting = list(results)
     while waiting:
         part = waiting.pop()
         while isinstance(part, np.ndarray) and isinstance(part.base, np.ndarray):
             part = part.base  # a view keeps the whole array
-        if id(part) in counted:
+        if id(part) in seen or isinstance(part, type):
             continue
-        counted.add(id(part))
+        seen.add(id(part))
         if isinstance(part, np.ndarray):
-            total += part.nbytes
+            sizes[id(part)] = part.nbytes
         elif isinstance(part, SuperLU):
-            total += _BYTES_PER_FACTOR * part.nnz
+            sizes[id(part)] = _BYTES_PER_FACTOR * part.nnz
         elif isinstance(part, bytes):
-            total += len(part)
-        else:
-            waiting.extend(_parts(part))
-    return total
-
-
-def _parts(whole: Any) -> Iterable[Any]:
-    """Objects that an object refers to; none for classes and for what has no members."""
-    if isinstance(whole, dict):
-        return list(whole.values())
-    if isinstance(whole, tuple | list):
-        return whole
-    if isinstance(whole, type):
-        return ()
-    if is_dataclass(whole) and not hasattr(whole, "__dict__"):
-        return [getattr(whole, field.name) for field in fields(whole)]
-    return list(getattr(whole, "__dict__", {}).values())  # a copy, because another thread may add to it
+            sizes[id(part)] = len(part)
+        elif isinstance(part, dict | list):
+            members = list(part.values() if isinstance(part, dict) else part)  # another thread may add to it
+            growing.append((part, len(members)))
+            waiting += members
+        elif isinstance(part, tuple):
+            waiting += part
+        elif hasattr(part, "__dict__"):
+            waiting.append(vars(part))
+        elif is_dataclass(part):
+            waiting += [getattr(part, field.name) for field in fields(part)]
+    return sizes, growing
 
 
 def clear_cache() -> None:
@@ -149,20 +160,9 @@ def clear_cache() -> None:
 
 def chip_key(chip: Chip) -> Hashable:
     """All of a chip except its name, as part of a cache key."""
-    return (
-        chip.mask.shape,
-        chip.mask.tobytes(),
-        chip.um_per_px,
-        chip.openings,
-        chip.viscosity_mpa_s,
-        chip.density_kg_m3,
-        chip.depth_um,
-        chip.walls,
-        friction_key(chip),
-        chip.law,
-    )
+    return tuple(array_key(getattr(chip, field.name)) for field in fields(chip) if field.name != "name")
 
 
-def friction_key(chip: Chip) -> bytes:
-    """The friction of the chip's pixels, as part of a cache key."""
-    return b"" if chip.friction_per_um2 is None else chip.friction_per_um2.tobytes()
+def array_key(value: Any) -> Hashable:
+    """A value, or shape and bytes of an array, as part of a cache key."""
+    return (value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value

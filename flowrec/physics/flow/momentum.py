@@ -16,17 +16,19 @@ faces, which leaves the flow of second order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.physics.flow.assembly import Triplets, per_flux
 from flowrec.physics.flow.centre_values import centre_operator
-from flowrec.physics.flow.contour_smoothing import Floats, Ints
 from flowrec.physics.flow.grid import INLET, OPEN, OUTLET, WALL, Faces, Grid
 from flowrec.physics.flow.level_set import LevelSet
+from flowrec.physics.flow.linear_solver import Factors, factorise
 from flowrec.physics.flow.wall_stencils import Profiles, line_profiles
 
 # A wall that is nearer than this, in cells, would make a face infinitely stiff.
@@ -36,10 +38,11 @@ NEAREST = 0.02
 LEAST_VOLUME = 0.25
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Momentum:
     """Sparse operators on the fluxes of the faces."""
 
+    grid: Grid
     viscous: Any  # A (faces, faces)
     volume: Floats  # (faces,) V: 1, or 1/2 at outlets, over the open fraction
     side_flux: Any  # (6 faces, faces) outward flux through the six sides of each control volume
@@ -62,24 +65,18 @@ class Momentum:
         by_velocity = sp.diags_array(self.side_flux @ flux) @ self.side_velocity
         return gather @ (by_flux + by_velocity)
 
-
-@dataclass(slots=True)
-class _Triplets:
-    """Entries of a sparse matrix, collected in parts."""
-
-    shape: tuple[int, int]
-    parts: list[tuple[Ints, Ints, Floats]] = field(default_factory=list)
-
-    def add(self, rows: Ints, columns: Ints, values: Floats | float) -> None:
-        """Add values where both row and column are numbered; rows broadcast against columns."""
-        rows, columns, values = np.broadcast_arrays(rows, columns, values)
-        numbered = (rows >= 0) & (columns >= 0)
-        self.parts.append((rows[numbered], columns[numbered], values[numbered].astype(np.float64)))
-
-    def matrix(self) -> Any:
-        """CSR with the sums of duplicate entries."""
-        rows, columns, values = (np.concatenate(part) for part in zip(*self.parts, strict=True))
-        return sp.csr_array((values, (rows, columns)), shape=self.shape)
+    @cached_property
+    def poisson(self) -> tuple[Any, Factors]:
+        """Transposed gradient (cells, faces) of the free faces, and factors of the Laplacian; made when first used."""
+        free = np.ones(self.grid.faces)
+        for faces in (self.grid.u, self.grid.v):
+            free[faces.number[faces.kind == INLET]] = 0.0
+        gradient = sp.diags_array(free) @ self.gradient
+        laplacian = gradient.T @ gradient
+        if not any(opening.kind == "outlet" for opening in self.grid.openings):
+            # In a closed box the level of the pressure is free: that of the first cell is set to 0.
+            laplacian = laplacian + sp.coo_array(([1.0], ([0], [0])), shape=laplacian.shape)
+        return gradient.T.tocsr(), factorise(laplacian)
 
 
 class _Sides:
@@ -107,45 +104,38 @@ class _Sides:
 class _Operators:
     """The matrices under assembly; see Momentum."""
 
-    viscous: _Triplets
+    viscous: Triplets
     side_flux: _Sides
     side_velocity: _Sides
-    gradient: _Triplets
-    open_fraction: Floats
+    gradient: Triplets
 
 
 def assemble(grid: Grid) -> Momentum:
     """All operators of a grid."""
     n = grid.faces
     fraction = grid.open_fraction
-    operators = _Operators(_Triplets((n, n)), _Sides(n), _Sides(n), _Triplets((n, grid.cells)), fraction)
+    operators = _Operators(Triplets((n, n)), _Sides(n), _Sides(n), Triplets((n, grid.cells)))
     sliding = np.zeros((n, 4))
     upright = _add_component(operators, sliding[:, 2:], grid.u, grid.v, grid.number_p, grid.walls)
     # The balance of v is that of u with rows and columns exchanged.
-    transposed = LevelSet(grid.walls.level.T, grid.walls.staircase)
-    level = _add_component(operators, sliding[:, :2], grid.v.T, grid.u.T, grid.number_p.T, transposed)
+    level = _add_component(operators, sliding[:, :2], grid.v.T, grid.u.T, grid.number_p.T, grid.walls.T)
     volume, outlet = np.ones(n), np.zeros((n, len(grid.openings)))
     for index, opening in enumerate(grid.openings):
         if opening.kind == "outlet":
             outlet[opening.faces, index] = opening.inward
             volume[opening.faces] = 0.5
     return Momentum(
-        _per_flux(operators.viscous.matrix(), fraction),
+        grid,
+        per_flux(operators.viscous.matrix(), fraction),
         volume / fraction,
         operators.side_flux.matrix(),
-        _per_flux(operators.side_velocity.matrix(), fraction),
+        per_flux(operators.side_velocity.matrix(), fraction),
         operators.gradient.matrix(),
         outlet,
-        _per_flux(centre_operator(grid, upright, level), fraction),
+        per_flux(centre_operator(grid, upright, level), fraction),
         sliding,
         (upright, level),
     )
-
-
-def _per_flux(per_velocity: Any, open_fraction: Floats) -> Any:
-    """A matrix that acts on velocities, changed to act on fluxes."""
-    per_velocity.data /= open_fraction[per_velocity.indices]
-    return per_velocity
 
 
 def _add_component(
@@ -170,25 +160,19 @@ def _add_component(
     sliding[me] = 2.0 * half_volume[:, None] * profiles.border[row, 2]
     # Along the flow, at the height t of the middle of the fluid part.
     lines = neighbouring_lines(own, profiles, walls, j, i)
-    inner, line, simple, cut = lines.inner, lines.line, lines.simple, ~lines.simple
-    own_middle = profiles.value(row[cut], lines.t[cut])
+    unused = lines.simple[:, None] & [True, False, True]  # columns without a weight
+    columns = np.where(unused, -1, profiles.columns[row])
     for side, step in enumerate((1, -1)):
-        factor = inner[side] / (lines.total * lines.distance[side])
-        seen = simple & (line[side] >= 0)
-        # Where nothing is cut, averages over whole faces can stand for point values.
-        operators.viscous.add(me[simple], me[simple], factor[simple])
-        operators.viscous.add(me[seen], profiles.columns[line[side][seen], 1], -factor[seen])
-        operators.viscous.add(me[cut, None], profiles.columns[row[cut]], factor[cut, None] * own_middle)
-        seen = cut & (line[side] >= 0)
-        there = profiles.value(line[side][seen], lines.t[seen])
-        operators.viscous.add(me[seen, None], profiles.columns[line[side][seen]], -factor[seen, None] * there)
+        factor = (lines.inner[side] / (lines.total * lines.distance[side]))[:, None]
+        operators.viscous.add(me[:, None], columns, factor * lines.middle)
+        operators.viscous.add(me[:, None], np.where(unused, -1, lines.columns[side]), -factor * lines.beyond[side])
         operators.gradient.add(me, around[j + 1, i + (step > 0)], -float(step))
 
-    scale = 1.0 / np.maximum(operators.open_fraction[me], LEAST_VOLUME)
+    scale = 1.0 / np.maximum((own.high - own.low)[j, i], LEAST_VOLUME)
     for side, step in enumerate((1, -1)):
         # The side is in the middle of a cell, or on the border at an outlet, where the velocity does not change.
         neighbour = numbers[j + 1, i + 1 + step]
-        half = np.where(inner[side], 0.5, 1.0)
+        half = np.where(lines.inner[side], 0.5, 1.0)
         for entry, column in enumerate((me, neighbour)):
             operators.side_flux.put(side, me, entry, column, half * step * scale)
             operators.side_velocity.put(side, me, entry, column, half)
@@ -208,12 +192,13 @@ def _add_component(
 class NeighbouringLines:
     """Neighbours to the right and to the left, in this order, of upright faces (n,), at the height t of each face."""
 
-    t: Floats  # (n,) middle of the fluid part, from the middle of the cell's side
-    inner: tuple[NDArray[np.bool_], NDArray[np.bool_]]  # (n,) not beyond the image's border
-    line: tuple[Ints, Ints]  # (n,) rows of the profiles of the faces there; -1 where a wall comes first
-    distance: tuple[Floats, Floats]  # (n,) to that face or to the wall, in cells
-    simple: NDArray[np.bool_]  # (n,) no wall cuts these faces
+    simple: Bools  # (n,) no wall cuts these faces: averages over whole faces can stand for point values
     total: Floats  # (n,) distance between the middles of both ways; 1 on the border
+    middle: Floats  # (n, 3) weights of the face's own profile in the velocity in the middle of its fluid part
+    inner: list[Bools]  # (n,) not beyond the image's border
+    distance: list[Floats]  # (n,) to the face there or to the wall, in cells
+    columns: list[Ints]  # (n, 3) faces in the profile there; -1 where a wall comes first
+    beyond: list[Floats]  # (n, 3) their weights in the velocity there
 
 
 def neighbouring_lines(own: Faces, profiles: Profiles, walls: LevelSet, j: Ints, i: Ints) -> NeighbouringLines:
@@ -222,20 +207,28 @@ def neighbouring_lines(own: Faces, profiles: Profiles, walls: LevelSet, j: Ints,
     t = 0.5 * (own.low + own.high)[j, i] - 0.5
     here = _level_at(walls.level, j, i, t)
     whole = own.high - own.low > 1.0 - 1e-12
-    inner, line, distance, simple = [], [], [], whole[j, i].copy()
+    inner, rows, distance, simple = [], [], [], whole[j, i].copy()
     for step in (1, -1):
         inside = (i + step >= 0) & (i + step <= w)
         beyond = np.clip(i + step, 0, w)
         there = _level_at(walls.level, j, beyond, t)
         open_ = inside & (own.kind[j, beyond] != WALL) & (there > 0.0)
-        line.append(np.where(open_, profiles.place[j, beyond], -1))
+        rows.append(np.where(open_, profiles.place[j, beyond], -1))
         inner.append(inside)
         to_wall = np.where(there > 0.0, 1.0, here / np.maximum(here - there, 1e-12))
         distance.append(np.where(open_, 1.0, np.clip(to_wall, NEAREST, 1.0)))
         simple &= ~inside | (open_ & whole[j, beyond]) | (~open_ & (distance[-1] == 1.0))
-    total = np.where(inner[0] & inner[1], 0.5 * (distance[0] + distance[1]), 1.0)
+    middle, *others = (
+        np.where(simple[:, None], [0.0, 1.0, 0.0], profiles.value(row, t)) for row in (profiles.place[j, i], *rows)
+    )
     return NeighbouringLines(
-        t, (inner[0], inner[1]), (line[0], line[1]), (distance[0], distance[1]), simple, np.asarray(total)
+        simple,
+        np.where(inner[0] & inner[1], 0.5 * (distance[0] + distance[1]), 1.0),
+        middle,
+        inner,
+        distance,
+        [np.where(row[:, None] >= 0, profiles.columns[row], -1) for row in rows],
+        others,
     )
 
 
@@ -243,4 +236,4 @@ def _level_at(level: Floats, j: Ints, i: Ints, t: Floats) -> Floats:
     """Level on the upright faces (j, i) at height t, linear between their ends and their midpoint."""
     middle = level[2 * j + 1, 2 * i]
     end = np.where(t < 0.0, level[2 * j, 2 * i], level[2 * j + 2, 2 * i])
-    return np.asarray(middle + 2.0 * np.abs(t) * (end - middle))
+    return middle + 2.0 * np.abs(t) * (end - middle)

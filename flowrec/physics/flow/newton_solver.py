@@ -8,21 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from flowrec.core import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.physics.arrays import Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.flow import grid as grids
 from flowrec.physics.flow import momentum as momenta
 from flowrec.physics.flow import streamfunction as streams
-from flowrec.physics.flow.contour_smoothing import Floats
-from flowrec.physics.flow.grid import INLET, Grid
+from flowrec.physics.flow.grid import Grid
 from flowrec.physics.flow.level_set import LevelSet
-from flowrec.physics.flow.linear_solver import Factors, compute_cached, factorise, friction_key
+from flowrec.physics.flow.linear_solver import Factors, array_key, compute_cached, factorise
 from flowrec.physics.flow.momentum import Momentum
 from flowrec.physics.flow.streamfunction import StreamBasis
 
@@ -87,7 +86,6 @@ class Scales:
     """From the chip's units to those of the equations: velocities in m/s, pressures as p h / mu in m/s."""
 
     inertia: float  # rho h / mu, s/m; 0 for Stokes flow
-    friction: float  # f = 12 h^2 / H^2 of a shallow chip, else 0
     pressure: float  # mu / h, Pa per m/s
     drive_per_unit: Floats  # (openings,) m/s per um/s or per Pa
     drive: Floats  # (openings,) the chip's boundary values, m/s
@@ -99,7 +97,7 @@ class Scales:
         mu = chip.viscosity_mpa_s * PA_S_PER_MPA_S
         per_unit = np.array([M_PER_UM if opening.kind == "inlet" else h / mu for opening in chip.openings])
         inertia = chip.density_kg_m3 * h / mu if convection else 0.0
-        return cls(inertia, depth_friction(chip, k), mu / h, per_unit, chip.boundary_values * per_unit)
+        return cls(inertia, mu / h, per_unit, chip.boundary_values * per_unit)
 
 
 def depth_friction(chip: Chip, k: int) -> float:
@@ -113,39 +111,71 @@ def local_friction(friction_per_um2: Floats, um_per_px: float, grid: Grid) -> Fl
 
 
 @dataclass(frozen=True, eq=False)
-class System:
-    """Operators of one geometry.
+class Equations:
+    """The discrete equations of one geometry and one kind of fluid.
 
     The unknowns are the fluxes of the faces (faces,) in m/s. A drive (openings,) holds inlet speeds in m/s and outlet
     pressures p h / mu in m/s. A push (faces,) is a further force on the right side, in m/s, such as a moving wall.
     """
 
-    grid: Grid
     momentum: Momentum
     stream: StreamBasis
-    resistance: Any  # A + f V (faces, faces)
+
+    @property
+    def grid(self) -> Grid:
+        """The grid."""
+        return self.momentum.grid
+
+    def viscous_force(self, flux: Floats) -> Floats:
+        """(faces,) viscous force and drag of the depth, with the sign of a resistance; m/s."""
+        raise NotImplementedError
+
+    def residual(self, flux: Floats, drive: Floats, inertia: float, push: Floats | float = 0.0) -> Floats:
+        """(faces,) residual of the momentum equations without the inner pressure, which has to balance it; m/s."""
+        convection = inertia * self.momentum.convection(flux)
+        return self.viscous_force(flux) + convection - (self.momentum.outlet @ drive + push)
+
+    def unbalanced_fraction(self, flux: Floats, load: Floats) -> float:
+        """Largest part of a load (faces,) that no pressure can balance, relative to the largest viscous term."""
+        left = self.stream.curl.T @ load
+        terms = abs(self.stream.curl).T @ np.abs(self.viscous_force(flux))
+        return float(np.abs(left).max(initial=0.0) / max(float(terms.max(initial=0.0)), 1e-300))
+
+    def velocity(self, flux: Floats) -> Floats:
+        """Velocity (n, 2) at the centres of the fluid pixels in m/s, of fluxes (faces,)."""
+        return np.asarray((self.momentum.centre @ flux).reshape(-1, 2))
+
+    def pressure(self, load: Floats) -> Floats:
+        """Cell values p h / mu (cells,) whose gradient balances a load (faces,); the pressure at outlets is zero."""
+        divergence, factors = self.momentum.poisson
+        return factors.solve(divergence @ load)
+
+
+@dataclass(frozen=True, eq=False)
+class System(Equations):
+    """The equations of a Newtonian fluid."""
+
+    friction: float  # f = 12 h^2 / H^2 of a shallow chip, else 0
+    resistance: Any  # A + f V (faces, faces), with the friction of single pixels
     stokes: Factors  # of C' (A + f V) C
+
+    def viscous_force(self, flux: Floats) -> Floats:
+        return np.asarray(self.resistance @ flux)
+
+    def force_by_friction(self, flux: Floats) -> Floats:
+        """(faces,) derivative of the viscous force with respect to ln of the depth friction."""
+        return self.friction * (self.momentum.volume * flux)
+
+    def changed_residual(self, flux: Floats, drive: Floats, inertia: float, friction: float, law: Floats) -> Floats:
+        """(faces,) `residual` with the depth friction times 1 + `friction`; the fluid has no law."""
+        load = self.residual(flux, drive, inertia)
+        return load + friction * self.friction * (self.momentum.volume * flux) if friction else load
 
     def linear(self, drives: Floats, push: Floats | float = 0.0) -> Floats:
         """Stokes fluxes (faces,) or (faces, n) for drives (openings,) or (openings, n)."""
         given = self.stream.inflow @ drives
         force = self.stream.curl.T @ (self.momentum.outlet @ drives + push - self.resistance @ given)
         return np.asarray(self.stream.curl @ self.stokes.solve(np.ascontiguousarray(force)) + given)
-
-    def residual(self, flux: Floats, drive: Floats, inertia: float, push: Floats | float = 0.0) -> Floats:
-        """(faces,) residual of the momentum equations without the inner pressure, which has to balance it; m/s."""
-        convection = inertia * self.momentum.convection(flux)
-        return np.asarray(self.resistance @ flux + convection - (self.momentum.outlet @ drive + push))
-
-    def velocity(self, flux: Floats) -> Floats:
-        """Velocity (n, 2) at the centres of the fluid pixels in m/s, of fluxes (faces,)."""
-        return np.asarray((self.momentum.centre @ flux).reshape(-1, 2))
-
-    def unbalanced_fraction(self, flux: Floats, load: Floats) -> float:
-        """Largest part of a load (faces,) that no pressure can balance, relative to the largest viscous term."""
-        left = self.stream.curl.T @ load
-        terms = abs(self.stream.curl).T @ np.abs(self.resistance @ flux)
-        return float(np.abs(left).max(initial=0.0) / max(float(terms.max(initial=0.0)), 1e-300))
 
     def steady(
         self, drive: Floats, inertia: float, max_iterations: int, tolerance: float, push: Floats | float = 0.0
@@ -185,11 +215,11 @@ class System:
         factors, last, step, grew = self.stokes, np.inf, np.inf, 0
         for number in range(1, max_iterations + 1):
             right = -(self.stream.curl.T @ self.residual(flux, drive, inertia, push))
-            change = np.asarray(self.stream.curl @ factors.solve(right))
+            change = self.stream.curl @ factors.solve(right)
             step = float(np.abs(change).max()) / speed
             if not np.isfinite(step) or step > WORTH_KEEPING * last or step > 0.5:
                 factors = self.tangent(flux, inertia)[0]
-                change = np.asarray(self.stream.curl @ factors.solve(right))
+                change = self.stream.curl @ factors.solve(right)
                 step = float(np.abs(change).max()) / speed
             grew += step > last
             if not np.isfinite(step) or step > RUNAWAY or grew > PATIENCE:
@@ -197,7 +227,7 @@ class System:
             flux = flux + change
             last = step
             if step <= tolerance:
-                return np.asarray(flux), number, step
+                return flux, number, step
         return None, max_iterations, step
 
     def tangent(self, flux: Floats, inertia: float) -> tuple[Factors, Any]:
@@ -207,30 +237,17 @@ class System:
         operator = self.resistance + inertia * self.momentum.convection_jacobian(flux)
         return factorise(self.stream.curl.T @ operator @ self.stream.curl), operator
 
-    def pressure(self, load: Floats) -> Floats:
-        """Cell values p h / mu (cells,) whose gradient balances a load (faces,); the pressure at outlets is zero."""
-        divergence, factors = self._poisson
-        return np.asarray(factors.solve(divergence @ load))
-
-    @cached_property
-    def _poisson(self) -> tuple[Any, Factors]:
-        """Transposed gradient (cells, faces) of the free faces, and factors of the Laplacian; made when first used."""
-        kinds = np.concatenate([self.grid.u.kind.ravel(), self.grid.v.kind.ravel()])
-        numbers = np.concatenate([self.grid.u.number.ravel(), self.grid.v.number.ravel()])
-        free = np.ones(self.grid.faces)
-        free[numbers[kinds == INLET]] = 0.0
-        gradient = sp.diags_array(free) @ self.momentum.gradient
-        laplacian = gradient.T @ gradient
-        if not any(opening.kind == "outlet" for opening in self.grid.openings):
-            # In a closed box the level of the pressure is free: that of the first cell is set to 0.
-            laplacian = laplacian + sp.coo_array(([1.0], ([0], [0])), shape=laplacian.shape)
-        return gradient.T.tocsr(), factorise(laplacian)
-
 
 def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel, from the cache if they are there."""
-    key = ("system", *geometry_key(chip, k))
-    equations: System = compute_cached(key, lambda: _assemble(chip, k))
+
+    def compute() -> System:
+        # Friction of single pixels changes only the resistance of a chip without it.
+        if chip.friction_per_um2 is None:
+            return newton_equations(chip, k)
+        return with_friction(system(replace(chip, friction_per_um2=None), k), chip.friction_per_um2, chip.um_per_px)
+
+    equations: System = compute_cached(("system", *geometry_key(chip, k)), compute)
     return equations
 
 
@@ -238,14 +255,7 @@ def geometry_key(chip: Chip, k: int) -> tuple[Hashable, ...]:
     """All of a chip that the matrices depend on, as part of a cache key."""
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
     mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    return (*mask, openings, chip.walls, k, depth_friction(chip, k), friction_key(chip))
-
-
-def _assemble(chip: Chip, k: int) -> System:
-    """Assemble without the cache. Friction of single pixels changes only the resistance of a chip without it."""
-    if chip.friction_per_um2 is None:
-        return newton_equations(chip, k)
-    return with_friction(system(replace(chip, friction_per_um2=None), k), chip.friction_per_um2, chip.um_per_px)
+    return (*mask, openings, chip.walls, k, depth_friction(chip, k), array_key(chip.friction_per_um2))
 
 
 def with_friction(bare: System, friction_per_um2: Floats, um_per_px: float) -> System:
@@ -257,8 +267,8 @@ def with_friction(bare: System, friction_per_um2: Floats, um_per_px: float) -> S
 
 def newton_equations(chip: Chip, k: int, walls: LevelSet | None = None) -> System:
     """Assemble the equations without the cache. `walls` replaces the walls of the mask."""
-    grid = grids.build(chip, k, walls)
-    momentum = momenta.assemble(grid)
-    stream = streams.assemble(grid)
-    resistance = sp.csr_array(momentum.viscous + sp.diags_array(depth_friction(chip, k) * momentum.volume))
-    return System(grid, momentum, stream, resistance, factorise(stream.curl.T @ resistance @ stream.curl))
+    momentum = momenta.assemble(grids.build(chip, k, walls))
+    stream, friction = streams.assemble(momentum.grid), depth_friction(chip, k)
+    resistance = sp.csr_array(momentum.viscous + sp.diags_array(friction * momentum.volume))
+    stokes = factorise(stream.curl.T @ resistance @ stream.curl)
+    return System(momentum, stream, friction, resistance, stokes)

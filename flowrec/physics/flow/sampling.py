@@ -8,55 +8,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import FlowError, FlowField, cell_at, cells_at
+from flowrec.core import FlowError, FlowField
+from flowrec.physics.arrays import Bools, Floats
 from flowrec.physics.flow.velocity_stencil import velocities_at, velocity_at
 
 _NO_WALLS = np.zeros((0, 0), np.float32)
 _NO_WALLS.flags.writeable = False
 
 
-def sample(field: FlowField, points_um: ArrayLike) -> NDArray[np.float64]:
+def sample(field: FlowField, points_um: ArrayLike) -> Floats:
     """Velocity (..., 2) in um/s at points (..., 2) in um; zero in solid and outside the mask's image.
 
     It follows the profile of the channel between pixel centres (velocity_stencil); a field that does not state its
     walls is bilinear. In the outer half pixel the value of the border pixel holds. A single point takes a few
     microseconds, for use in the control loop.
     """
-    points = np.asarray(points_um, np.float64)
+    points = np.asarray(points_um, np.float64) / field.um_per_px
     velocity, wall_px = field.velocity_um_s, walls_of(field)
-    if wall_px.size:
-        if points.ndim == 1:
-            x, y = (points / field.um_per_px).tolist()
-            h, w = wall_px.shape
-            inside = -0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5
-            return np.array(velocity_at(velocity, wall_px, x, y) if inside else (0.0, 0.0))
-        flat = np.ascontiguousarray(points.reshape(-1, 2) / field.um_per_px)
-        return velocities_at(velocity, wall_px, flat).reshape(points.shape)
-    if points.ndim == 1:
-        x_um, y_um = points.tolist()
-        return np.array(_at_point(velocity, x_um / field.um_per_px, y_um / field.um_per_px))
-    cells = cells_at(points / field.um_per_px, velocity.shape)
-    return np.where(cells.inside[..., None], cells.interpolate(velocity), 0.0)
+    if points.ndim > 1:
+        return velocities_at(velocity, wall_px, np.ascontiguousarray(points.reshape(-1, 2))).reshape(points.shape)
+    x, y = points.tolist()
+    h, w = velocity.shape[:2]
+    inside = -0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5
+    return np.array(velocity_at(velocity, wall_px, x, y) if inside else (0.0, 0.0))
 
 
 def walls_of(field: FlowField) -> NDArray[np.float32]:
     """`wall_px` of a field for the kernels of velocity_stencil: of no pixels where the field is to be bilinear."""
     return field.wall_px if field.wall_px is not None and min(field.wall_px.shape) > 1 else _NO_WALLS
-
-
-def _at_point(velocity: NDArray[np.float32], x: float, y: float) -> tuple[float, float]:
-    """Bilinear at one point (x, y) in pixels, in the same order of operations as Cells, without numpy's overhead."""
-    h, w = velocity.shape[:2]
-    if not (-0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5):
-        return 0.0, 0.0
-    row, column, below, right, a, b = cell_at(x, y, velocity.shape)
-    block = velocity[row : below + 1, column : right + 1].tolist()
-    upper, lower = block[0], block[-1]
-    vx, vy = (
-        (1.0 - b) * ((1.0 - a) * upper[0][c] + a * upper[-1][c]) + b * ((1.0 - a) * lower[0][c] + a * lower[-1][c])
-        for c in (0, 1)
-    )
-    return vx, vy
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +47,7 @@ class FieldError:
     v: float
 
 
-def relative_rmse(field: FlowField, truth: FlowField, mask: NDArray[np.bool_]) -> FieldError:
+def relative_rmse(field: FlowField, truth: FlowField, mask: Bools) -> FieldError:
     """sqrt(sum |v - v*|^2 / sum |v*|^2) at the centres of the fluid pixels of a mask (h, w): Table I of the paper.
 
     Both sums are over points, so both fields must hold values at pixel centres. A true field at rest gives NaN.
@@ -86,14 +65,14 @@ def relative_rmse(field: FlowField, truth: FlowField, mask: NDArray[np.bool_]) -
     error = (field.velocity_um_s - truth.velocity_um_s)[mask].astype(np.float64)
     true = truth.velocity_um_s[mask].astype(np.float64)
 
-    def ratio(error: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    def ratio(error: Floats, true: Floats) -> float:
         total = float((true**2).sum())
         return float(np.sqrt((error**2).sum() / total)) if total > 0 else float("nan")
 
     return FieldError(ratio(error[:, 0], true[:, 0]), ratio(error[:, 1], true[:, 1]), ratio(error, true))
 
 
-def fluid_image(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[Any]:
+def fluid_image(mask: Bools, values: NDArray[Any]) -> NDArray[Any]:
     """Values (n, ...) of the fluid pixels in raster order as an image (h, w, ...) that is 0 in solid."""
     image = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
     image[mask] = values

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from flowrec.core import UM_PER_M
-from flowrec.physics.flow.contour_smoothing import Floats
+from flowrec.physics.arrays import Floats
+from flowrec.physics.flow.assembly import averages
 from flowrec.physics.flow.generalised import GeneralisedSystem
-from flowrec.physics.flow.grid import Grid, GridOpening
+from flowrec.physics.flow.grid import Grid, GridOpening, number_where
+from flowrec.physics.flow.level_set import subcells
 from flowrec.physics.flow.linear_solver import Factors
 from flowrec.physics.flow.newton_solver import Scales, System
 
@@ -76,7 +77,7 @@ class Sensitivities:
             return Remainder(remainder.flux, 0.0)
         flux = self.flux + self.flux_modes @ offset + remainder.flux
         curl = self.equations.stream.curl
-        step = np.asarray(curl @ self.factors.solve(-(curl.T @ self._load(offset, flux))))
+        step = curl @ self.factors.solve(-(curl.T @ self._load(offset, flux)))
         return Remainder(remainder.flux + step, float(np.abs(step).max() / max(np.abs(flux).max(), 1e-300)))
 
     def _friction_change(self, offset: Floats) -> float:
@@ -88,12 +89,8 @@ class Sensitivities:
         scales = self.scales
         drive = scales.drive + scales.drive_per_unit * offset[: self.openings]
         inertia = scales.inertia * float(np.exp(-offset[self.openings]))
-        friction = self._friction_change(offset)
-        if isinstance(self.equations, GeneralisedSystem):
-            law = offset[len(offset) - len(self.law_unknowns) :]
-            return self.equations.with_changes(friction, law).residual(flux, drive, inertia)
-        load = self.equations.residual(flux, drive, inertia)
-        return load + friction * scales.friction * (self.equations.momentum.volume * flux) if friction else load
+        law = offset[len(offset) - len(self.law_unknowns) :]
+        return self.equations.changed_residual(flux, drive, inertia, self._friction_change(offset), law)
 
     def pressure(self, offset: Floats, remainder: Remainder) -> Floats:
         """Pressure (n,) in Pa at the chip's own viscosity; at fixed parameters it is proportional to the viscosity."""
@@ -122,10 +119,7 @@ def sensitivities(
     push = [momentum.outlet * scales.drive_per_unit, scales.inertia * momentum.convection(flux)[:, None]]
     if friction:
         given.append(none)
-        if isinstance(equations, GeneralisedSystem):
-            push.append(-equations.force_by_friction(flux)[:, None])
-        else:
-            push.append(-scales.friction * (momentum.volume * flux)[:, None])
+        push.append(-equations.force_by_friction(flux)[:, None])
     if shapes:
         for opening in grid.openings:
             if opening.kind == "inlet":
@@ -138,7 +132,7 @@ def sensitivities(
         push.append(-equations.force_by_unknowns(flux))
     prescribed = np.concatenate(given, axis=1)
     force = stream.curl.T @ (np.concatenate(push, axis=1) - operator @ prescribed)
-    modes = np.asarray(stream.curl @ factors.solve(np.ascontiguousarray(force)) + prescribed)
+    modes = stream.curl @ factors.solve(np.ascontiguousarray(force)) + prescribed
     return Sensitivities(
         equations,
         factors,
@@ -155,14 +149,10 @@ def sensitivities(
 
 def _cell_average(grid: Grid) -> Any:
     """The averages of Grid.pressure as a matrix (n, cells)."""
-    n = int(np.count_nonzero(grid.mask))
-    number = np.full(grid.mask.shape, -1, np.int64)
-    number[grid.mask] = np.arange(n)
-    pixel = np.repeat(np.repeat(number, grid.k, axis=0), grid.k, axis=1)
+    number, count = number_where(grid.mask, 0)
+    pixel = subcells(number, grid.k)
     inside = (pixel >= 0) & (grid.number_p >= 0)
-    count = np.bincount(pixel[inside], minlength=n)
-    weights = 1.0 / count[pixel[inside]]
-    return sp.csr_array((weights, (pixel[inside], grid.number_p[inside])), shape=(n, grid.cells))
+    return averages(pixel[inside], grid.number_p[inside], (count, grid.cells))
 
 
 def _shape(grid: Grid, opening: GridOpening, skew: bool) -> Floats:
@@ -177,8 +167,4 @@ def _shape(grid: Grid, opening: GridOpening, skew: bool) -> Floats:
     h, w = grid.fluid.shape
     psi = np.zeros((h + 1, w + 1))
     psi[opening.vertices] = opening.streamfunction_sign * 0.5 * count * 1.5 * potential
-    flux = np.zeros(grid.faces)
-    for number, difference in ((grid.u.number, np.diff(psi, axis=0)), (grid.v.number, -np.diff(psi, axis=1))):
-        numbered = number >= 0
-        flux[number[numbered]] = difference[numbered]
-    return flux
+    return grid.on_faces(np.diff(psi, axis=0), -np.diff(psi, axis=1))

@@ -8,9 +8,9 @@ from typing import Annotated
 import numpy as np
 
 from flowrec.core import UM_PER_M, FlowError, FlowField, OneOf, Range
+from flowrec.physics.arrays import Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.fluid import law_text
-from flowrec.physics.flow.contour_smoothing import Floats
 from flowrec.physics.flow.generalised import GeneralisedSystem, generalised_system
 from flowrec.physics.flow.linear_solver import chip_key, compute_cached
 from flowrec.physics.flow.newton_solver import NotConvergedError, Scales, System, system

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from flowrec.core import FlowError
-from flowrec.physics.flow.contour_smoothing import Floats, Ints
-from flowrec.physics.flow.grid import WALL, Grid
+from flowrec.physics.arrays import Floats, Ints
+from flowrec.physics.flow.assembly import Triplets, components
+from flowrec.physics.flow.grid import WALL, Grid, number_where
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,20 +41,19 @@ def assemble(grid: Grid) -> StreamBasis:
     tail = np.concatenate([corner[:-1].ravel(), corner[:, 1:].ravel()])
     head = np.concatenate([corner[1:].ravel(), corner[:, :-1].ravel()])
     wall = np.concatenate([grid.u.kind.ravel(), grid.v.kind.ravel()]) == WALL
-    joined = sp.coo_array((np.ones(wall.sum(), bool), (tail[wall], head[wall])), shape=(corner.size, corner.size))
-    _, label = connected_components(joined, directed=False)
-    tail, head = label[tail[~wall]].astype(np.int64), label[head[~wall]].astype(np.int64)
+    label = components(tail[wall], head[wall], corner.size)
+    tail, head = label[tail[~wall]], label[head[~wall]]
 
-    root, offset = _chain_inlets(grid, label[corner].astype(np.int64))
+    root, offset = _chain_inlets(grid, label[corner])
     # The gauge is the wall with most faces: its row would be the densest of the system.
     count = np.bincount(np.concatenate([root[tail], root[head]]))
-    unknown = np.full(len(root), -1, np.int64)
-    used = np.flatnonzero(count)
-    used = used[used != np.argmax(count)]
-    unknown[used] = np.arange(len(used))
-    rows, columns = np.tile(np.arange(grid.faces), 2), unknown[root[np.concatenate([head, tail])]]
-    signs, free = np.repeat([1.0, -1.0], grid.faces), columns >= 0
-    curl = sp.csr_array((signs[free], (rows[free], columns[free])), shape=(grid.faces, len(used)))
+    used = count > 0
+    used[np.argmax(count)] = False
+    unknown, unknowns = number_where(used, 0)
+    entries = Triplets((grid.faces, unknowns))
+    for end, sign in ((head, 1.0), (tail, -1.0)):
+        entries.add(np.arange(grid.faces), unknown[root[end]], sign)
+    curl = entries.matrix()
     curl.eliminate_zeros()
     # Row 0 of the table: corners without an offset.
     table = np.stack([np.zeros(len(grid.openings)), *offset.values()])

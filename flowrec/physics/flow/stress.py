@@ -19,13 +19,14 @@ the fluid.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from flowrec.physics.flow.contour_smoothing import Floats, Ints
+from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.physics.flow.assembly import Triplets, averages, per_flux, scaled_rows
 from flowrec.physics.flow.grid import INLET, OUTLET, WALL, Faces, Grid
 from flowrec.physics.flow.level_set import LevelSet
 from flowrec.physics.flow.momentum import Momentum, neighbouring_lines
@@ -37,10 +38,8 @@ SHORTEST = 0.5
 # within a cell has at least 1/4.
 LEAST_WEIGHT = 0.1
 
-Bools = NDArray[np.bool_]
 
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Stress:
     """Sparse operators on the fluxes of the faces: r stresses, m points with a viscosity, g gradients."""
 
@@ -51,6 +50,13 @@ class Stress:
     square: Any  # (m, g) gamma^2 = square @ gradients^2
     planar: int  # number of gradients that are not across the depth
     viscous: int  # number of stresses that are not the drag of the depth
+    curl: Any  # (faces, unknowns) fluxes of stream functions
+
+    @cached_property
+    def on_streams(self) -> tuple[Any, Any, Any]:
+        """Operators gather, strain and gradient on stream functions; made when first used."""
+        left, strain, gradient = self.curl.T @ self.gather, self.strain @ self.curl, self.gradient @ self.curl
+        return left.tocsr(), strain.tocsr(), gradient.tocsr()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,28 +65,29 @@ class _Component:
 
     me: Ints  # numbers
     balanced: Bools  # with a balance of momentum
-    along: tuple[Any, Any]  # u_x to the right and to the left
-    across: tuple[Any, Any]  # u_y below and above
-    parts: tuple[Any, Any, Any, Any]  # a_k: to the right, to the left, below, above
+    along: list[Any]  # u_x to the right and to the left
+    across: list[Any]  # u_y below and above
+    parts: list[Any]  # a_k: to the right, to the left, below, above
     transposed: tuple[Floats, Floats]  # (n,) b_k over u_x to the right, over v_x below; the others have the other sign
-    inner: tuple[Bools, Bools]  # whether there are cells to the right and to the left
+    inner: list[Bools]  # whether there are cells to the right and to the left
     cells: tuple[Ints, Ints]  # their points
     corners: tuple[Ints, Ints]  # the points below and above
 
 
-def assemble(grid: Grid, momentum: Momentum, friction: Floats | None) -> Stress:
+def assemble(momentum: Momentum, curl: Any, friction: Floats | None) -> Stress:
     """Operators of a grid; `friction` (faces,) is the factor 12 h^2 / H^2 of a shallow chip, else None."""
+    grid = momentum.grid
     h, w = grid.fluid.shape
     cell = np.arange(h * w).reshape(h, w)
     corner = h * w + np.arange((h + 1) * (w + 1)).reshape(h + 1, w + 1)
     fraction = grid.open_fraction
     upright, level = momentum.profiles
     u = _component(grid.u, grid.walls, upright, cell, corner, fraction)
-    transposed = LevelSet(grid.walls.level.T, grid.walls.staircase)
-    v = _component(grid.v.T, transposed, level, cell.T, corner.T, fraction)
+    v = _component(grid.v.T, grid.walls.T, level, cell.T, corner.T, fraction)
     points = h * w + corner.size
     shear, wall, mixed = _corner_gradients(grid, u, v, points)
-    square, gradient, planar = _shear_rate(grid, _cell_gradients(u, v, points), shear, wall, friction, fraction)
+    strain_rate = _cell_gradients(u, v, points)
+    square, gradient, planar = _shear_rate(grid, cell, corner, strain_rate, shear, wall, friction, fraction)
     rows, faces, places = zip(*(_stresses(part, other) for part, other in ((u, mixed[1]), (v, mixed[0]))), strict=True)
     strain, face, place = sp.vstack(rows, format="csr"), np.concatenate(faces), np.concatenate(places)
     viscous = len(place)
@@ -98,7 +105,7 @@ def assemble(grid: Grid, momentum: Momentum, friction: Floats | None) -> Stress:
         face = np.concatenate([face, balanced])
     gather = sp.csr_array((np.ones(len(face)), (face, np.arange(len(face)))), shape=(grid.faces, len(face)))
     used = np.unique(at.indices)  # no stress needs the others
-    return Stress(gather, strain, at[:, used], gradient, square[used], planar, viscous)
+    return Stress(gather, strain, at[:, used], gradient, square[used], planar, viscous, curl)
 
 
 def _component(
@@ -111,37 +118,30 @@ def _component(
     lines = neighbouring_lines(faces, profiles, walls, j, i)
 
     def matrix(columns: Ints, values: Floats) -> Any:
-        rows = np.broadcast_to(np.arange(len(me))[:, None], columns.shape)
-        known = columns >= 0
-        values = values[known] / fraction[columns[known]]
-        return sp.csr_array((values, (rows[known], columns[known])), shape=(len(me), n))
+        entries = Triplets((len(me), n))
+        entries.add(np.arange(len(me))[:, None], columns, values)
+        return per_flux(entries.matrix(), fraction)
 
-    middle = np.where(lines.simple[:, None], [0.0, 1.0, 0.0], profiles.value(row, lines.t))
-    along, parts = [], []
+    columns, along, parts = profiles.columns[row], [], []
     for side, step in enumerate((1.0, -1.0)):
-        there = lines.line[side]
-        beyond = np.where(lines.simple[:, None], [0.0, 1.0, 0.0], profiles.value(there, lines.t))
-        columns = np.concatenate(
-            [profiles.columns[row], np.where(there[:, None] >= 0, profiles.columns[there], -1)], axis=1
-        )
         slope = lines.inner[side] * step / lines.distance[side]
-        along.append(matrix(columns, slope[:, None] * np.concatenate([-middle, beyond], axis=1)))
+        weights = slope[:, None] * np.concatenate([-lines.middle, lines.beyond[side]], axis=1)
+        along.append(matrix(np.concatenate([columns, lines.columns[side]], axis=1), weights))
         parts.append(scaled_rows(-step / lines.total, along[-1]))
     half = np.where((i == 0) | (i == w), 0.5, 1.0)
     low, high = faces.low[j, i] - 0.5, faces.high[j, i] - 0.5
-    columns = profiles.columns[row]
     length = np.maximum(high - low, SHORTEST)
     bend, mean = profiles.weights[row, 2], profiles.slope(row, 0.5 * (low + high)) / length[:, None]
-    across = tuple(matrix(columns, profiles.slope(row, end)) for end in (high, low))
+    across = [matrix(columns, profiles.slope(row, end)) for end in (high, low)]
     parts += [matrix(columns, -half[:, None] * (bend + sign * mean)) for sign in (1.0, -1.0)]
     kind = faces.kind[j, i]
     whole = (kind != OUTLET) & lines.simple  # half volumes and cut faces have no transposed part
     return _Component(
         me,
         kind != INLET,
-        (along[0], along[1]),
-        (across[0], across[1]),
-        (parts[0], parts[1], parts[2], parts[3]),
+        along,
+        across,
+        parts,
         (whole * -1.0 / lines.total, whole * -half / length),
         lines.inner,
         (cell[j, np.minimum(i, w - 1)], cell[j, np.maximum(i - 1, 0)]),
@@ -149,23 +149,12 @@ def _component(
     )
 
 
-def scaled_rows(factors: NDArray[Any], matrix: Any) -> Any:
-    """CSR `matrix` with its rows times `factors`; ten times as fast as the product with a diagonal matrix."""
-    data = matrix.data * np.repeat(factors, np.diff(matrix.indptr))
-    return sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
-
-
-def _mean_at(
-    points: int, places: tuple[Ints, Ints], values: tuple[Any, Any], known: tuple[Bools, Bools] | None
-) -> tuple[Any, Bools]:
+def _mean_at(points: int, places: tuple[Ints, Ints], values: list[Any], known: list[Bools] | None) -> tuple[Any, Bools]:
     """(points, faces) means of gradients over those at the same point; and which points (points,) have one."""
     place = np.concatenate(places)
-    chosen = np.ones(len(place), bool) if known is None else np.concatenate(known)
-    column = np.flatnonzero(chosen)
-    count = np.bincount(place[chosen], minlength=points)
-    weights = 1.0 / count[place[chosen]]
-    mean = sp.csr_array((weights, (place[chosen], column)), shape=(points, len(place)))
-    return mean @ sp.vstack(values, format="csr"), count > 0
+    column = np.arange(len(place)) if known is None else np.flatnonzero(np.concatenate(known))
+    mean = averages(place[column], column, (points, len(place)))
+    return mean @ sp.vstack(values, format="csr"), np.diff(mean.indptr) > 0
 
 
 def _cell_gradients(u: _Component, v: _Component, points: int) -> tuple[Any, Bools]:
@@ -200,23 +189,28 @@ def _corner_gradients(grid: Grid, u: _Component, v: _Component, points: int) -> 
 
 
 def _shear_rate(
-    grid: Grid, cells: tuple[Any, Bools], shear: Any, wall: Any, friction: Floats | None, fraction: Floats
+    grid: Grid,
+    cell: Ints,
+    corner: Ints,
+    cells: tuple[Any, Bools],
+    shear: Any,
+    wall: Any,
+    friction: Floats | None,
+    fraction: Floats,
 ) -> tuple[Any, Any, int]:
     """Weights of the squared gradients at the points (points, g), the gradients (g, faces), how many are not speeds."""
-    h, w = grid.fluid.shape
     points, n = shear.shape
     level = grid.walls.level
     strain, known = cells
     fluid = np.concatenate([(level[1::2, 1::2] > 0.0).ravel(), (level[::2, ::2] > 0.0).ravel()])
-    cell = np.arange(h * w).reshape(h, w)
-    corner = h * w + np.arange((h + 1) * (w + 1)).reshape(h + 1, w + 1)
     ends = [corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]]
-    pairs = np.concatenate([end.ravel() for end in ends]), np.tile(cell.ravel(), 4)
-    sheared = np.diff(shear.indptr) > 0  # corners with a gradient
-    # Means over the corners of a cell, and over the cells in fluid around a corner.
-    to_cell = _mean(pairs[1], pairs[0], sheared[pairs[0]], points)
-    to_corner = _mean(pairs[0], pairs[1], (known & fluid)[pairs[1]], points)
-    is_cell = np.arange(points) < h * w
+    at_corner, at_cell = np.concatenate([end.ravel() for end in ends]), np.tile(cell.ravel(), 4)
+    # Means over the corners of a cell that have a gradient, and over the cells in fluid around a corner.
+    used = (np.diff(shear.indptr) > 0)[at_corner]
+    to_cell = averages(at_cell[used], at_corner[used], (points, points))
+    used = (known & fluid)[at_cell]
+    to_corner = averages(at_corner[used], at_cell[used], (points, points))
+    is_cell = np.arange(points) < cell.size
     open_cell, closed_cell = is_cell & fluid, is_cell & ~fluid
     one = sp.diags_array
     by_strain = one(4.0 * open_cell) + scaled_rows(4.0 * (~is_cell & fluid), to_corner)
@@ -230,7 +224,7 @@ def _shear_rate(
     keep = [np.diff(part.indptr) > 0 for part in gradients]
     planar = int(sum(part.sum() for part in keep))
     if friction is not None:
-        squares.append(_speeds(grid, cell, corner, fluid, points))
+        squares.append(_speeds(grid, cell, corner, fluid))
         # 6 V / H between cells at the distance h, for f = 12 h^2 / H^2.
         gradients.append(one(np.sqrt(3.0 * friction) / fraction).tocsr())
         keep.append(np.ones(n, bool))
@@ -240,16 +234,9 @@ def _shear_rate(
     return square, gradient, planar
 
 
-def _mean(rows: Ints, columns: Ints, used: Bools, size: int) -> Any:
-    """(size, size) means of columns over the used pairs of a row and a column."""
-    rows, columns = rows[used], columns[used]
-    count = np.bincount(rows, minlength=size)
-    return sp.csr_array((1.0 / count[rows], (rows, columns)), shape=(size, size))
-
-
-def _speeds(grid: Grid, cell: Ints, corner: Ints, fluid: Bools, points: int) -> Any:
+def _speeds(grid: Grid, cell: Ints, corner: Ints, fluid: Bools) -> Any:
     """(points, faces) weights of the squared velocities of faces in the squared speed at points in fluid."""
-    rows, columns = [], []
+    entries = Triplets((len(fluid), grid.faces))
     for number, cells, corners in ((grid.u.number, cell, corner), (grid.v.number.T, cell.T, corner.T)):
         for place, faces in (
             (cells, number[:, :-1]),
@@ -257,11 +244,8 @@ def _speeds(grid: Grid, cell: Ints, corner: Ints, fluid: Bools, points: int) -> 
             (corners[1:], number),
             (corners[:-1], number),
         ):
-            known = (faces >= 0) & fluid[place]
-            rows.append(place[known])
-            columns.append(faces[known])
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    return sp.csr_array((np.full(len(row), 0.5), (row, column)), shape=(points, grid.faces))
+            entries.add(np.where(fluid[place], place, -1), faces, 0.5)
+    return entries.matrix()
 
 
 def _stresses(part: _Component, other: Any) -> tuple[Any, Ints, Ints]:

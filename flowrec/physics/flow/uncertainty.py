@@ -5,12 +5,12 @@ It is not a message: it follows from the recorded observations and is computed a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flowrec.physics.arrays import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Registration:
 
     def on_chip(self, measured_um: Floats) -> Floats:
         """(n, 2) places on the chip of measured places (n, 2)."""
-        return np.asarray(self.centre_um + self.offset_um + (measured_um - self.centre_um) @ self._turn.T)
+        return self.centre_um + self.offset_um + (measured_um - self.centre_um) @ self._turn.T
 
     @property
     def matrix(self) -> Floats:
@@ -66,7 +66,7 @@ class Registration:
     def to_measured(self, on_chip_um: Floats) -> Floats:
         """(n, 2) where places (n, 2) on the chip are measured."""
         away = on_chip_um - self.centre_um - self.offset_um
-        return np.asarray(self.centre_um + np.linalg.solve(self._turn, away.T).T)
+        return self.centre_um + np.linalg.solve(self._turn, away.T).T
 
     @property
     def _turn(self) -> Floats:
@@ -116,10 +116,6 @@ class FlowUncertainty:
         """The expected relative error of the flow over the mask, as in `FlowField.error_share`."""
         speed = float(np.sqrt((self.mean_um_s**2).sum()))
         return float(np.sqrt((self.std_um_s**2).sum())) / max(speed, 1e-300)
-
-    def with_covariance(self, covariance: Floats) -> FlowUncertainty:
-        """A copy with another covariance (p + r, p + r) of the modes."""
-        return replace(self, covariance=covariance)
 
     def effect(self, pixels: NDArray[np.intp], own_um_s: Floats) -> Floats:
         """(p + r + k, m, 2) what a unit of each unknown, and each doubt, adds to the flow observed in m fluid pixels.

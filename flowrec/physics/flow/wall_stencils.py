@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.physics.flow.contour_smoothing import Floats, Ints
-from flowrec.physics.flow.grid import OPEN, OUTLET, WALL, Faces
+from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.physics.flow.grid import OPEN, OUTLET, WALL, Faces, number_where
 from flowrec.physics.flow.level_set import LevelSet
 
 # Walls on both sides of a single face, closer than this many cells, would make it infinitely stiff.
@@ -37,12 +37,12 @@ class Profiles:
     def value(self, rows: Ints, t: Floats) -> Floats:
         """Weights (m, 3) of the columns in the velocity at t (m,)."""
         w = self.weights[rows]
-        return np.asarray(w[:, 0] + t[:, None] * (w[:, 1] + t[:, None] * w[:, 2]))
+        return w[:, 0] + t[:, None] * (w[:, 1] + t[:, None] * w[:, 2])
 
     def slope(self, rows: Ints, t: Floats) -> Floats:
         """Weights (m, 3) of the columns in the derivative along the line at t (m,), per cell."""
         w = self.weights[rows]
-        return np.asarray(w[:, 1] + 2.0 * t[:, None] * w[:, 2])
+        return w[:, 1] + 2.0 * t[:, None] * w[:, 2]
 
 
 def line_profiles(faces: Faces, walls: LevelSet, cross: NDArray[np.int8]) -> Profiles:
@@ -59,8 +59,7 @@ def line_profiles(faces: Faces, walls: LevelSet, cross: NDArray[np.int8]) -> Pro
     """
     fluid = faces.kind != WALL
     j, i = np.nonzero(fluid)
-    place = np.full(fluid.shape, -1, np.int64)
-    place[j, i] = np.arange(len(j))
+    place, _ = number_where(fluid, 0)
     # Away from walls a face and both neighbours are whole, and all such faces share one parabola.
     whole = fluid & (faces.high - faces.low > 1.0 - 1e-12)
     linked = walls.level[2:-1:2, ::2] > 0.0
@@ -76,9 +75,7 @@ def line_profiles(faces: Faces, walls: LevelSet, cross: NDArray[np.int8]) -> Pro
     return Profiles(place, columns, weights, border)
 
 
-def _at_walls(
-    faces: Faces, walls: LevelSet, cross: NDArray[np.int8], j: Ints, i: Ints
-) -> tuple[NDArray[np.bool_], Floats, Floats]:
+def _at_walls(faces: Faces, walls: LevelSet, cross: NDArray[np.int8], j: Ints, i: Ints) -> tuple[Bools, Floats, Floats]:
     """Mask (n, 3) of existing columns, weights and border of the faces (j, i), which walls may cut."""
     h, w = faces.kind.shape[0], faces.kind.shape[1] - 1
     low, high = faces.low, faces.high

@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from flowrec.core import compiled
 
-Raster = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Points = Floats  # (n, 2), or (2,) of one
+Raster = Floats  # (h, w)
+Mask = NDArray[np.bool_]  # (h, w)
 # The 8 neighbours of a pixel, by the angle; the opposite of number k is number k + 4.
 NEIGHBOUR_X = np.array([1, 1, 0, -1, -1, -1, 0, 1], np.int64)
 NEIGHBOUR_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)

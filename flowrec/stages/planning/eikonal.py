@@ -17,13 +17,10 @@ import heapq
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import bilinear, bilinear_known, compiled
-from flowrec.stages.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, CostRasters, Raster
+from flowrec.stages.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, CostRasters, Points, Raster
 from flowrec.stages.planning.kernels import line_is_clear, segment_cost, step_cost, step_energy
-
-Points = NDArray[np.float64]
 
 _STEP_PX = 1.5  # of a descent
 _DIRECTIONS, _BISECTIONS = 64, 5  # of a step: around the circle, then about the best of them

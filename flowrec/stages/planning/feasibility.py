@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
-from numpy.typing import NDArray
 
 from flowrec.core import FlowField
 from flowrec.physics import Chip, Robot, distance_um, sample
-from flowrec.stages.planning.cost_rasters import Mask, Raster
+from flowrec.stages.planning.cost_rasters import Mask, Points, Raster
 from flowrec.stages.planning.free_space import CourseError, FreeSpace, open_space
-from flowrec.stages.planning.problem import attach_goal, attach_start
+from flowrec.stages.planning.problem import Endpoint, attach_goal, attach_start
 
-Points = NDArray[np.float64]
 _EIGHT = np.ones((3, 3), np.int64)
+
+
+def joined_ends(space: FreeSpace, start_um: Points, goal_um: Points) -> tuple[Endpoint, Endpoint, str]:
+    """Start and goal (2,), joined to nodes; and the error text if one of them is not, or they are not connected."""
+    start, goal = attach_start(space, start_um), attach_goal(space, goal_um)
+    return start, goal, start.error or goal.error or why_apart(space, start.node, goal.node)
 
 
 def why_apart(space: FreeSpace, a: int, b: int) -> str:
@@ -77,9 +83,7 @@ def swept_out(chip: Chip, field: FlowField, start_um: Points, course_error: Cour
 
 def no_room(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, robot: Robot) -> str:
     """Error text if a robot does not fit through from start to goal (2,) even without a margin, else ''."""
-    space = open_space(chip, field, robot.radius_um, 0.0)
-    start, goal = attach_start(space, start_um), attach_goal(space, goal_um)
-    return start.error or goal.error or why_apart(space, start.node, goal.node)
+    return joined_ends(open_space(chip, field, robot.radius_um, 0.0), start_um, goal_um)[2]
 
 
 def narrowest(space: FreeSpace, start_um: Points, goal_um: Points) -> str:
@@ -111,14 +115,8 @@ def _bottleneck(clearance: Raster, a: int, b: int) -> float:
     values = np.unique(flat[(flat > 0.0) & (flat <= min(flat[a], flat[b]))])
     if len(values) == 0 or not _are_connected(clearance >= values[0], a, b):
         return -1.0
-    low, high = 0, len(values)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if _are_connected(clearance >= values[middle], a, b):
-            low = middle
-        else:
-            high = middle
-    return float(values[low])
+    too_high = range(1, len(values))
+    return float(values[bisect_left(too_high, True, key=lambda k: not _are_connected(clearance >= values[k], a, b))])
 
 
 def _bottleneck_pixel(clearance: Raster, widest: float, a: int, b: int) -> tuple[int, int]:

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowError, FlowField, Range, UsageError, bilinear
+from flowrec.core import FlowError, FlowField, Range, UsageError
 from flowrec.physics import COURSE, Chip, Robot, clearance_um
-from flowrec.stages.planning.cost_rasters import CostRasters, Mask, Raster
+from flowrec.stages.planning.cost_rasters import CostRasters, Floats, Mask, Raster
 
 _LEAST_SPEED_RATIO = 0.02  # of the robot's speed, left where the flow may be wrong by more than that speed
 
@@ -41,25 +40,14 @@ class FreeSpace:
         """Number of columns."""
         return int(self.free.shape[1])
 
-    def clearance_at(self, point: NDArray[np.float64]) -> float:
-        """Clearance (px) at a point (2,) in px."""
-        return bilinear(self.clearance, float(point[0]), float(point[1]))
-
-    def usable_clearance_at(self, point: NDArray[np.float64]) -> float:
-        """Usable clearance (px) at a point (2,) in px."""
-        return bilinear(self.usable_clearance, float(point[0]), float(point[1]))
-
-    def pixel(self, node: int) -> NDArray[np.float64]:
+    def pixel(self, node: int) -> Floats:
         """(2,) px of a node, which is a flat index of the rasters."""
         return np.array([node % self.width, node // self.width], np.float64)
 
-    def with_margin(self, margin_um: float) -> FreeSpace:
-        """The free space of a robot that keeps another margin from the walls."""
-        return self.with_need(self.radius + margin_um / self.um_per_px)
-
-    def with_course_share(self, share: float) -> FreeSpace:
-        """The free space of a robot that is off its course by this fraction of the course error; to be asked first."""
-        return replace(self, swept=self.radius + share * (self.swept - self.radius))
+    def with_reserves(self, course_share: float, margin_um: float) -> FreeSpace:
+        """The free space of a robot that keeps a fraction of the course error and another margin from the walls."""
+        less = replace(self, swept=self.radius + course_share * (self.swept - self.radius))
+        return less.with_need(self.radius + margin_um / self.um_per_px)
 
     def with_need(self, need: float) -> FreeSpace:
         """The free space of a robot that needs another clearance (px)."""
@@ -100,7 +88,7 @@ class CourseError:
         flow = np.hypot(velocity[..., 0], velocity[..., 1])
         way = self.frame_s * (flow + self.speed_um_s)
         off_um_s = self.map_error * flow + self.heading_error_rad * self.speed_um_s
-        return np.asarray(self.blind_s * off_um_s + way**2 / (16.0 * self.radius_um))
+        return self.blind_s * off_um_s + way**2 / (16.0 * self.radius_um)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A* and Dijkstra's algorithm on the pixels, and the two planners that are nothing else: fastest and shortest.
+"""A* and Dijkstra's algorithm on the pixels, and the planners that are nothing else: fastest, shortest, the paper's.
 
 One compiled search serves all: the neighbours are offsets, and the cost of an edge is one of three, each with its
 heuristic h for the way from x to the goal:
@@ -7,7 +7,7 @@ heuristic h for the way from x to the goal:
     TRAVEL_TIME  time at ground speed, Simpson's rule over dx,      h = |goal - x| / (V + max |v|)
     PAPER        |dx| |dx / |dx| - v / V| with v where dx begins,   h = the same for goal - x
 
-The first two heuristics are admissible and consistent. The third is not admissible (see astar_paper.py).
+The first two heuristics are admissible and consistent. The third is not admissible.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import Route, bilinear, compiled
-from flowrec.stages.planning.cost_rasters import CostRasters, Raster
+from flowrec.stages.planning.cost_rasters import CostRasters, Floats, Ints, Raster
 from flowrec.stages.planning.free_space import FreeSpace
 from flowrec.stages.planning.kernels import line_is_clear, step_time
 from flowrec.stages.planning.path_refinement import refined_route
@@ -28,7 +27,6 @@ from flowrec.stages.planning.problem import Problem
 from flowrec.stages.planning.route import no_route, too_fast
 
 LENGTH, TRAVEL_TIME, PAPER = 0, 1, 2
-Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +37,7 @@ class AstarLength:
 
     def plan(self, problem: Problem) -> Route:
         """The route of a problem."""
-        path = shortest_path(problem, LENGTH, directions(self.reach_px))
-        return too_fast_route(problem, self.reach_px) if path is None else problem.timed(problem.with_ends(path))
+        return _pixel_route(problem, LENGTH, directions(self.reach_px), self.reach_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,20 +49,48 @@ class AstarTime:
 
     def plan(self, problem: Problem) -> Route:
         """The route of a problem."""
-        path = shortest_path(problem, TRAVEL_TIME, directions(self.reach_px))
-        if path is None:
-            return too_fast_route(problem, self.reach_px)
-        path, rasters = problem.with_ends(path), problem.space.cost_rasters(problem.speed)
-        return refined_route(problem, rasters, path) if self.refine else problem.timed(path)
+        return _pixel_route(problem, TRAVEL_TIME, directions(self.reach_px), self.reach_px, self.refine)
 
 
-def directions(reach_px: int) -> NDArray[np.int64]:
+@dataclass(frozen=True, slots=True)
+class AstarPaper:
+    """The paper's flow-aware A*, for comparison: its cost and its heuristic as printed, on neighbours within a radius.
+
+    The cost stays finite (2 |dx|) against a flow as fast as the robot, and the heuristic is not admissible, so its
+    routes are neither the fastest nor always possible. The paper finds the neighbours with a K-D tree; on pixels they
+    are all offsets within the radius.
+    """
+
+    paper_radius_px: float
+    reach_px: int  # of the shortest path, which the reason names if there is no route
+
+    def plan(self, problem: Problem) -> Route:
+        """The route of a problem."""
+        return _pixel_route(problem, PAPER, offsets_within(self.paper_radius_px), self.reach_px)
+
+
+def _pixel_route(problem: Problem, cost: int, offsets: Ints, reach_px: int, refine: bool = False) -> Route:
+    """The route along the path of least cost; where there is none, the reason names the shortest one."""
+    path = shortest_path(problem, cost, offsets)
+    if path is None:
+        return too_fast_route(problem, reach_px)
+    path = problem.with_ends(path)
+    return refined_route(problem, problem.space.cost_rasters(problem.speed), path) if refine else problem.timed(path)
+
+
+def directions(reach_px: int) -> Ints:
     """(n, 2) offsets (x, y) in all distinct directions within `reach_px` pixels: 8, 16, 32 for 1, 2, 3."""
     span = range(-reach_px, reach_px + 1)
     return np.array([(a, b) for a in span for b in span if math.gcd(a, b) == 1], np.int64)
 
 
-def shortest_path(problem: Problem, cost: int, offsets: NDArray[np.int64]) -> Points | None:
+def offsets_within(radius_px: float) -> Ints:
+    """(n, 2) offsets (x, y) of all pixels within a radius; 1.5 gives the 8 neighbours."""
+    span = range(-math.floor(radius_px), math.floor(radius_px) + 1)
+    return np.array([(a, b) for a in span for b in span if 0 < a * a + b * b <= radius_px * radius_px], np.int64)
+
+
+def shortest_path(problem: Problem, cost: int, offsets: Ints) -> Floats | None:
     """(n, 2) px from the start's node to the goal's at the least cost; None if there is no path."""
     space, goal = problem.space, problem.goal.node
     spent, parent = search(space, cost, offsets, problem.speed, problem.start.node, goal)
@@ -83,19 +108,23 @@ def too_fast_route(problem: Problem, reach_px: int) -> Route:
 def search(
     space: FreeSpace,
     cost: int,
-    offsets: NDArray[np.int64],
+    offsets: Ints,
     speed: float,
     start: int,
     goal: int = -1,
     weight: Raster | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """`best_first` on a free space, for a robot of `speed` (px/s); every edge keeps the clearance `space.need`."""
-    rasters = space.cost_rasters(speed)._replace(clearance=space.clearance)
+    deviation: Raster | float = 0.0,
+) -> tuple[Floats, Ints]:
+    """`best_first` on a free space, for a robot of `speed` (px/s); every edge keeps the clearance `space.need`.
+
+    `deviation` (px/s) of the speed is kept against a worse flow.
+    """
+    rasters = space.cost_rasters(speed, deviation)._replace(clearance=space.clearance)
     weight = np.ones_like(space.clearance) if weight is None else weight
     return best_first(rasters, weight, cost, offsets, start, goal)
 
 
-def backtrack(parent: NDArray[np.int64], end: int, width: int) -> Points:
+def backtrack(parent: Ints, end: int, width: int) -> Floats:
     """(n, 2) points (x, y) in px from the root of the search to `end`."""
     chain = [end]
     while parent[chain[-1]] >= 0:
@@ -115,8 +144,8 @@ def paper_cost(dx: float, dy: float, vx: float, vy: float, speed: float) -> floa
 
 @compiled
 def best_first(
-    rasters: CostRasters, weight: Raster, cost: int, offsets: NDArray[np.int64], start: int, goal: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    rasters: CostRasters, weight: Raster, cost: int, offsets: Ints, start: int, goal: int
+) -> tuple[Floats, Ints]:
     """Paths of least cost from `start` until `goal` is reached, or to everywhere if `goal` is negative.
 
     Nodes are flat indices of free pixels (h, w). Edges lead to the pixels at `offsets` (n, 2) that are free and in a

@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from flowrec.core import bilinear, compiled, corner_weights
-from flowrec.stages.planning.cost_rasters import Raster
+from flowrec.stages.planning.cost_rasters import Floats, Raster
 
 
 @compiled
@@ -93,7 +90,7 @@ def segment_cost(
 
 
 @compiled
-def lowest_clearance(clearance: NDArray[np.float64], x0: float, y0: float, x1: float, y1: float) -> float:
+def lowest_clearance(clearance: Floats, x0: float, y0: float, x1: float, y1: float) -> float:
     """The least clearance (px) along a segment (px), sampled at least every quarter of a pixel."""
     n = 1 + int(4.0 * max(abs(x1 - x0), abs(y1 - y0)))
     lowest = math.inf
@@ -104,6 +101,6 @@ def lowest_clearance(clearance: NDArray[np.float64], x0: float, y0: float, x1: f
 
 
 @compiled
-def line_is_clear(clearance: NDArray[np.float64], x0: float, y0: float, x1: float, y1: float, need: float) -> bool:
+def line_is_clear(clearance: Floats, x0: float, y0: float, x1: float, y1: float, need: float) -> bool:
     """True if the clearance (px) is at least `need` all along a segment (px)."""
     return lowest_clearance(clearance, x0, y0, x1, y1) >= need

@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import Route, bilinear, compiled
-from flowrec.stages.planning.cost_rasters import CostRasters, Raster
+from flowrec.stages.planning.cost_rasters import CostRasters, Floats, Ints, Points, Raster
 from flowrec.stages.planning.kernels import lowest_clearance, segment_cost
 from flowrec.stages.planning.problem import Problem
 from flowrec.stages.planning.route import subdivide
 
-Points = NDArray[np.float64]
 SPACING_PX = 1.5  # of the points of a path
 _LONGEST_CHORD_PX = 12.0  # a straight piece that replaces points of a path: a channel's width or so
 _WIDEST_BUMP_PX = 48.0  # half width
@@ -63,9 +61,7 @@ def refine_path(
 
 
 @compiled
-def _cost(
-    points: Points, legs: int, rasters: CostRasters, weight: Raster, limit: float, costs: NDArray[np.float64]
-) -> float:
+def _cost(points: Points, legs: int, rasters: CostRasters, weight: Raster, limit: float, costs: Floats) -> float:
     """Sum of the weighted costs of the first legs of a polyline (n, 2); each is written to `costs` (legs,).
 
     It ends early when the sum reaches a limit.
@@ -83,7 +79,7 @@ def _cost(
 
 
 @compiled
-def _legs(points: Points, rasters: CostRasters, weight: Raster) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _legs(points: Points, rasters: CostRasters, weight: Raster) -> tuple[Floats, Floats]:
     """Cost (n - 1,) of each leg of a polyline (n, 2), and the clearance (n - 1,) that its successor must keep."""
     costs = np.empty(len(points) - 1)
     floors = np.empty(len(points) - 1)
@@ -134,9 +130,7 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
 
 
 @compiled
-def _with_bumps(
-    path: Points, rasters: CostRasters, weight: Raster, spacing: float, widths: NDArray[np.int64]
-) -> Points:
+def _with_bumps(path: Points, rasters: CostRasters, weight: Raster, spacing: float, widths: Ints) -> Points:
     """The path (n, 2) with its points shifted along the normal by cosine bumps of half widths `widths`, in points.
 
     A bump is kept if it lowers the cost; the height is halved when hardly any does.

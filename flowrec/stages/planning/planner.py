@@ -23,10 +23,10 @@ from flowrec.core import (
     check_ranges,
 )
 from flowrec.physics import Chip, FlowUncertainty, Opening, Robot
-from flowrec.stages.planning.feasibility import narrowest, too_swift, why_apart
+from flowrec.stages.planning.feasibility import joined_ends, narrowest, too_swift
 from flowrec.stages.planning.free_space import FastFlowMargin, spaces_by_margin
-from flowrec.stages.planning.problem import Problem, attach_goal, attach_start
-from flowrec.stages.planning.route import no_route, planning_speed_um_s
+from flowrec.stages.planning.problem import Problem
+from flowrec.stages.planning.route import no_route, planning_speed_um_s, with_remarks
 from flowrec.stages.planning.survey import SURVEYS, SurveyPlanner
 from flowrec.stages.planning.survey_design import Sampling, SurveyOrder
 
@@ -60,7 +60,7 @@ PLANNERS = Methods(
     ),
     Method(
         "astar_paper",
-        "flowrec.stages.planning.astar_paper:AstarPaper",
+        "flowrec.stages.planning.grid_search:AstarPaper",
         "A* with the paper's cost and heuristic as printed",
         ("paper_radius_px", "reach_px"),
     ),
@@ -163,14 +163,12 @@ class Planner:
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
         course_error = self.swift.course_error(robot, robot.speed_limit_um_s, field)
         for space, margin_um, less in spaces_by_margin(chip, field, robot, self.clearance_margin_um, course_error):
-            start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
-            error = start.error or goal.error or why_apart(space, start.node, goal.node)
+            start, goal, error = joined_ends(space, start_at, goal_at)
             if not error:
                 route = method.plan(
                     Problem(self.method, space, field, start, goal, goal_at, robot, margin_um, speed_um_s)
                 )
-                remarks = (less, start.remark, goal.remark, route.reason)
-                return replace(route, reason="; ".join(filter(None, remarks)))
+                return with_remarks(route, less, start.remark, goal.remark)
         if self.clearance_margin_um is not None:
             error = narrowest(space, start_at, goal_at) or error
         too_fast = too_swift(chip, field, start_at, goal_at, course_error)

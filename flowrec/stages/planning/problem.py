@@ -6,15 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowField, Route
+from flowrec.core import FlowField, Route, bilinear
 from flowrec.physics import Robot
+from flowrec.stages.planning.cost_rasters import Points
 from flowrec.stages.planning.free_space import FreeSpace
 from flowrec.stages.planning.kernels import line_is_clear
 from flowrec.stages.planning.route import timed_route
-
-Points = NDArray[np.float64]
 
 # A mask does not locate a wall better than this; an end of a route is not refused for less.
 _WALL_TOLERANCE_PX = 0.5
@@ -29,6 +27,10 @@ class Endpoint:
     point: Points | None  # (2,) px
     remark: str = ""
     error: str = ""
+
+    def place(self, space: FreeSpace) -> Points:
+        """(2,) px: the point itself, or its node."""
+        return space.pixel(self.node) if self.point is None else self.point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +105,7 @@ def _attach(space: FreeSpace, name: str, point_um: Points, within: float) -> End
     needs = f"the robot needs {space.need * space.um_per_px:.0f} um"
     if not (np.isfinite(point).all() and -0.5 <= point[0] <= w - 0.5 and -0.5 <= point[1] <= h - 0.5):
         return Endpoint(-1, None, error=f"{where} is outside the chip")
-    clearance = space.clearance_at(point)
+    clearance = bilinear(space.clearance, *point)
     clearance_um = clearance * space.um_per_px
     if clearance <= 0.0:
         return Endpoint(-1, None, error=f"{where} is in a wall")

@@ -7,18 +7,17 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flowrec.core import FlowField, Route
 from flowrec.physics import Chip, FlowUncertainty, Robot, fluid_image
+from flowrec.stages.planning.cost_rasters import Points
 from flowrec.stages.planning.planner import Planner
-from flowrec.stages.planning.route import planning_speed_um_s, travel_time
+from flowrec.stages.planning.route import planning_speed_um_s, travel_time, with_remarks
 
 # Of the time that is left: two plans of the same way in the same map may differ by about as much.
 _NUMERICAL_SHARE = 0.01
 _STEP = 0.2  # standard deviations of the flow, for a derivative
-
-Points = NDArray[np.float64]
 
 
 def better_route(
@@ -89,8 +88,7 @@ def _join_routes(present: Route, from_s: float, new: Route, said: str) -> Route:
     if before.any() and present.arrival_s[before][-1] >= from_s:  # the place itself is a waypoint
         before = present.arrival_s < from_s
     return replace(
-        new,
-        reason="; ".join(filter(None, (said, new.reason))),
+        with_remarks(new, said),
         waypoints_um=np.concatenate([present.waypoints_um[before], new.waypoints_um]),
         arrival_s=np.concatenate([present.arrival_s[before], from_s + new.arrival_s]),
     )

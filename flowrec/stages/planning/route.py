@@ -5,13 +5,14 @@ Every planner is timed here, in the same way: nothing that a planner assumed ent
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import FlowField, Route, UsageError
 from flowrec.physics import Robot, sample
+from flowrec.stages.planning.cost_rasters import Floats, Points
 
-Points = NDArray[np.float64]
 _STEPS_PER_PX = 4.0
 
 
@@ -35,18 +36,14 @@ def planning_speed_um_s(share: float, robot: Robot) -> float:
 
 def ground_speed(
     field: FlowField, points_um: Points, directions: Points, speed_um_s: float, idle_um_s: float | None = None
-) -> NDArray[np.float64]:
+) -> Floats:
     """Speed over ground (n,) in um/s of a robot at points (n, 2) that moves along directions (n, 2) of any length.
 
     d . v + sqrt(V^2 - |v_perp|^2); -inf where the flow across is faster than V. With `idle_um_s` the robot saves
     energy: sqrt(idle^2 + |v|^2), limited to what V allows (kernels.step_energy).
     """
     velocity = sample(field, points_um)
-    length = np.hypot(directions[:, 0], directions[:, 1])
-    unit = directions / np.where(length > 0.0, length, 1.0)[:, None]
-    along = unit[:, 0] * velocity[:, 0] + unit[:, 1] * velocity[:, 1]
-    across = unit[:, 0] * velocity[:, 1] - unit[:, 1] * velocity[:, 0]
-    spare = speed_um_s**2 - across**2
+    along, spare = along_and_spare(velocity, directions, speed_um_s)
     root = np.sqrt(np.maximum(spare, 0.0))
     ground = along + root
     if idle_um_s is not None:
@@ -54,9 +51,18 @@ def ground_speed(
     return np.where(spare >= 0.0, ground, -np.inf)
 
 
+def along_and_spare(velocity: Points, directions: Points, speed: float) -> tuple[Floats, Floats]:
+    """Flow (n,) along directions (n, 2) of any length, and V^2 - |v_perp|^2 (n,)."""
+    length = np.hypot(directions[:, 0], directions[:, 1])
+    unit = directions / np.where(length > 0.0, length, 1.0)[:, None]
+    along = unit[:, 0] * velocity[:, 0] + unit[:, 1] * velocity[:, 1]
+    across = unit[:, 0] * velocity[:, 1] - unit[:, 1] * velocity[:, 0]
+    return along, speed**2 - across**2
+
+
 def travel_time(
     field: FlowField, waypoints_um: Points, speed_um_s: float, idle_um_s: float | None = None
-) -> tuple[NDArray[np.float64], bool]:
+) -> tuple[Floats, bool]:
     """Times at which a robot that follows a polyline passes its points, and whether it can follow it.
 
     The ground speed is taken in the middle of steps of at most a quarter of a pixel.
@@ -93,6 +99,11 @@ def travel_time(
 def no_route(method: str, reason: str) -> Route:
     """The message that there is no route."""
     return Route(0, 0, method, False, reason, np.zeros((0, 2)), np.zeros(0))
+
+
+def with_remarks(route: Route, *remarks: str) -> Route:
+    """The route with remarks, as far as there are any, before its own."""
+    return replace(route, reason="; ".join(filter(None, (*remarks, route.reason))))
 
 
 def timed_route(

@@ -15,17 +15,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base, geometric, util
 
-from flowrec.core import Route
+from flowrec.core import Route, bilinear
+from flowrec.stages.planning.cost_rasters import Points
 from flowrec.stages.planning.free_space import FreeSpace
 from flowrec.stages.planning.kernels import line_is_clear, segment_cost
 from flowrec.stages.planning.planner import RrtSettings
 from flowrec.stages.planning.problem import Problem
 from flowrec.stages.planning.route import no_route
-
-Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +63,7 @@ class Rrt:
             def checkMotion(self, a: Any, b: Any, *_: Any) -> bool:  # noqa: N802
                 return line_is_clear(space.clearance, a[0], a[1], b[0], b[1], space.need - 1e-9)
 
-        information.setStateValidityChecker(lambda state: space.clearance_at(np.array([state[0], state[1]])) > 0.0)
+        information.setStateValidityChecker(lambda state: bilinear(space.clearance, state[0], state[1]) > 0.0)
         information.setMotionValidator(Motion(information))
         information.setup()
         definition = base.ProblemDefinition(information)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Protocol
+from dataclasses import dataclass, field
+from typing import Annotated
 
 from flowrec.core import Method, Methods, PositiveShare, Range, Route, Share
 from flowrec.stages.planning.free_space import FastFlowMargin
+from flowrec.stages.planning.route import with_remarks
 from flowrec.stages.planning.survey_design import SurveyOrder
 
 _ALL = ("speed_share", "clearance_margin_um", "swift", "middle_pull", "outlet_gap_radii")
@@ -40,18 +41,6 @@ SURVEYS = Methods(
         (*_ALL, "distance_um", "share"),
     ),
 )
-
-
-class SurveyMethod(Protocol):
-    """Interface of a row's target: a class whose fields are the row's options, with this method."""
-
-    def plan(self, order: SurveyOrder) -> Route:
-        """The route of the survey, or no route with its reason.
-
-        `more` of the route says whether another stretch is to be asked for on the way; it then begins as the route
-        that the order holds as `present`, with the same times.
-        """
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +104,5 @@ class SurveyPlanner:
         if self.needs_uncertainty and order.uncertainty is None:
             remark = f"survey {_NO_PRIOR}: nothing says how wrong the assumed flow may be"
             row = SURVEYS[_NO_PRIOR]
-        method: SurveyMethod = row.load()(**{option: getattr(self, option) for option in row.options})
-        route = method.plan(order)
-        return replace(route, reason="; ".join(filter(None, (remark, route.reason)))) if remark else route
+        route: Route = row.build(self).plan(order)
+        return with_remarks(route, remark)

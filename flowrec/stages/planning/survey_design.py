@@ -23,10 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import FlowField, Observations, Route, nearest_pixels
-from flowrec.physics import Chip, Doubts, FlowUncertainty, Robot
-
-METHOD = "survey"  # that the routes bear
-Floats = NDArray[np.float64]
+from flowrec.physics import Chip, FlowUncertainty, Robot
+from flowrec.stages.planning.cost_rasters import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +192,7 @@ class Looks:
             (sums / np.sqrt(least + total)[:, None, None]).transpose(1, 0, 2).reshape(unknowns, -1)
             for sums, total in ((before + added, weights_after), (before, weights))
         ]
-        return np.asarray(scaled @ scaled.T - shared[0] @ shared[0].T + shared[1] @ shared[1].T)
+        return scaled @ scaled.T - shared[0] @ shared[0].T + shared[1] @ shared[1].T
 
     def _after(self, which: NDArray[np.intp], weight: Floats, effect: Floats) -> Looks:
         sums, weights = self.sums.copy(), self.weights.copy()
@@ -233,18 +231,3 @@ def covariance_after(covariance: Floats, information: Floats) -> Floats:
     """(q, q) covariance after observations of an information (q, q), or (q + k, q + k) with doubts."""
     information = information[: len(covariance), : len(covariance)]
     return np.asarray(np.linalg.solve(np.eye(len(covariance)) + covariance @ information, covariance))
-
-
-def place_information(
-    uncertainty: FlowUncertainty, noise_um_s: float, chip: Chip, places_um: Floats
-) -> tuple[Need, list[Floats]]:
-    """The need of the whole map, and the information (q, q) of one observation in each of n places (n, 2).
-
-    Without a robot: what observations would be worth if they could be taken anywhere.
-    """
-    rows, columns = nearest_pixels(places_um / chip.um_per_px, chip.mask.shape)
-    pixel = (np.cumsum(chip.mask.ravel()) - 1)[rows * chip.mask.shape[1] + columns]
-    effect = replace(uncertainty, doubts=Doubts.none(0)).effect(pixel, np.zeros((len(pixel), 2)))
-    variance = noise_um_s**2 + uncertainty.error_um_s[pixel] ** 2
-    need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
-    return need, [effect[:, k] @ effect[:, k].T / variance[k] for k in range(len(pixel))]

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowField, Route
-from flowrec.physics import Chip
-from flowrec.stages.planning.free_space import FastFlowMargin, FreeSpace, spaces_by_margin
-from flowrec.stages.planning.grid_search import TRAVEL_TIME, backtrack, directions, search
-from flowrec.stages.planning.path_refinement import refine_path
-from flowrec.stages.planning.problem import attach_start, with_ends
-from flowrec.stages.planning.route import no_route, planning_speed_um_s, timed_route
-from flowrec.stages.planning.survey_design import METHOD, SurveyOrder
-from flowrec.stages.planning.survey_places import central_pixels, far_from_openings, middle_weight
+from flowrec.core import Route
+from flowrec.stages.planning.cost_rasters import Floats, Ints, Mask
+from flowrec.stages.planning.free_space import FreeSpace
+from flowrec.stages.planning.grid_search import backtrack
+from flowrec.stages.planning.problem import attach_start
+from flowrec.stages.planning.route import no_route, planning_speed_um_s, with_remarks
+from flowrec.stages.planning.survey_design import SurveyOrder
+from flowrec.stages.planning.survey_ways import METHOD, SurveyWays, central_among, fastest_ways
 
 # Default length of the survey, as a fraction of the path with the largest work of the flow.
 _SHARE, _SHARE_WITH_JUNCTIONS = 0.125, 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Downstream:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Downstream(SurveyWays):
     """A path with the flow that brings the robot past as much of it as the distance allows.
 
     A streamline may end in a stagnation point or circle behind a step. So every node is reached on its fastest path
@@ -33,66 +31,40 @@ class Downstream:
 
     distance_um: float | None
     share: float | None
-    speed_share: float
-    clearance_margin_um: float | None
-    swift: FastFlowMargin
-    middle_pull: float
-    outlet_gap_radii: float
 
     def plan(self, order: SurveyOrder) -> Route:
         """The one stretch of this survey."""
-        chip, robot, field = order.chip, order.robot, order.field
-        speed_um_s = planning_speed_um_s(self.speed_share, robot)
-        course_error = self.swift.course_error(robot, speed_um_s, field)
-        for space, _, less in spaces_by_margin(chip, field, robot, self.clearance_margin_um, course_error):
-            route = self._downstream(space, field, order.start_um, chip, speed_um_s, self.distance_um)
-            if route.reachable:
-                return replace(route, reason="; ".join(filter(None, (less, route.reason))))
-        return route
+        speed_um_s = planning_speed_um_s(self.speed_share, order.robot)
+        return self.by_margin(order, order.field, speed_um_s, lambda space: self._stretch(space, order, speed_um_s))
 
-    def _downstream(
-        self,
-        space: FreeSpace,
-        field: FlowField,
-        start_um: NDArray[np.float64],
-        chip: Chip,
-        speed_um_s: float,
-        limit_um: float | None,
-    ) -> Route:
-        start = attach_start(space, start_um)
+    def _stretch(self, space: FreeSpace, order: SurveyOrder, speed_um_s: float) -> Route:
+        start = attach_start(space, order.start_um)
         if start.error:
             return no_route(METHOD, start.error)
         px = space.um_per_px
-        weight = middle_weight(space, self.middle_pull)
-        cost, parent = search(space, TRAVEL_TIME, directions(2), speed_um_s / px, start.node, weight=weight)
+        cost, parent = fastest_ways(space, speed_um_s / px, start.node, self.weight(space))
         length, work = _along_tree(cost, parent, space)
-        far = far_from_openings(chip, self.outlet_gap_radii * space.radius)
-        allowed = np.isfinite(cost) & (work > 0.0) & far.ravel()
+        allowed = np.isfinite(cost) & (work > 0.0) & self.far_from_openings(space, order.chip).ravel()
         allowed[start.node] = False
         if not allowed.any():
             return no_route(METHOD, "nothing lies downstream of the start before the chip ends")
-        by_junctions = _SHARE if len(chip.openings) <= 2 else _SHARE_WITH_JUNCTIONS
-        share = self.share if self.share is not None else by_junctions
-        limit_px = share * length[_most_work(work, allowed)] if limit_um is None else limit_um / px
+        if self.distance_um is not None:
+            limit_px = self.distance_um / px
+        else:
+            by_junctions = _SHARE if len(order.chip.openings) <= 2 else _SHARE_WITH_JUNCTIONS
+            limit_px = (by_junctions if self.share is None else self.share) * length[_most_work(work, allowed)]
         allowed &= length <= limit_px
         if not allowed.any():
             return no_route(
                 METHOD, f"there is no place to survey within {limit_px * px:.0f} um downstream of the start"
             )
-        central = allowed & central_pixels(space.clearance).ravel()
-        end = _most_work(work, central if central.any() else allowed)
-        path = with_ends(space, backtrack(parent, end, space.width), start, None)
-        rasters = space.cost_rasters(speed_um_s / px)._replace(clearance=space.clearance)
-        for candidate in (refine_path(path, rasters, weight), path):
-            route = timed_route(METHOD, field, candidate * px, speed_um_s)
-            if route.reachable:
-                return replace(route, reason=start.remark)
-        return route
+        central = central_among(allowed.reshape(space.free.shape), space.clearance)
+        end = _most_work(work, central.ravel())
+        route = self.timed_stretch(space, order.field, backtrack(parent, end, space.width), start, speed_um_s)
+        return with_remarks(route, start.remark) if route.reachable else route
 
 
-def _along_tree(
-    cost: NDArray[np.float64], parent: NDArray[np.int64], space: FreeSpace
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _along_tree(cost: Floats, parent: Ints, space: FreeSpace) -> tuple[Floats, Floats]:
     """Length (h*w,) in px and work of the flow (h*w,) in px2/s along the path to each node of the search's tree."""
     length, work = np.zeros(len(cost)), np.zeros(len(cost))
     vx, vy = space.vx.ravel(), space.vy.ravel()
@@ -108,6 +80,6 @@ def _along_tree(
     return length, work
 
 
-def _most_work(work: NDArray[np.float64], allowed: NDArray[np.bool_]) -> int:
+def _most_work(work: Floats, allowed: Mask) -> int:
     """The allowed node (flat index) with the largest work of the flow along its path."""
     return int(np.argmax(np.where(allowed, work, -np.inf)))

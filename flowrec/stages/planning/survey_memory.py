@@ -11,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import Route
+from flowrec.stages.planning.cost_rasters import Floats
 
-Floats = NDArray[np.float64]
 MOST_PLACES = 500  # of a map of which the move is taken; it is as smooth as the modes of the flow
 _STATED, _EXPECTED, _MOVED, _PROGRESS, _END = range(5)  # columns of `Route.stretches`
 

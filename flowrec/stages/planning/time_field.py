@@ -12,11 +12,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Route
+from flowrec.core import Route, bilinear
 from flowrec.physics import RESERVE
-from flowrec.stages.planning.cost_rasters import interpolate_raster
+from flowrec.stages.planning.cost_rasters import Floats, interpolate_raster
 from flowrec.stages.planning.eikonal import descend, time_field
 from flowrec.stages.planning.grid_search import TRAVEL_TIME, directions, shortest_path, too_fast_route
 from flowrec.stages.planning.path_refinement import SPACING_PX, refined_route
@@ -60,9 +59,9 @@ class TimeField:
             idle_um_s = 0.5 * problem.speed_um_s if self.idle_speed_um_s is None else float(self.idle_speed_um_s)
         area = int(space.free.sum())
         usual = next((k for few, k in _FINER if area < few and k * k * space.free.size <= _LARGEST_PX), 1)
-        target = space.pixel(problem.goal.node) if problem.goal.point is None else problem.goal.point
+        target = problem.goal.place(space)
         first = space.pixel(problem.start.node)
-        if problem.start.point is not None and space.usable_clearance_at(problem.start.point) >= space.need:
+        if problem.start.point is not None and bilinear(space.usable_clearance, *problem.start.point) >= space.need:
             first = problem.start.point
         deviation = self._deviation(problem)
         tried = tuple(dict.fromkeys((self.robust_deviations, 0.5 * self.robust_deviations, 0.0)))
@@ -98,13 +97,11 @@ class TimeField:
 
         A route from whose start no time is known is returned as it is: a path without a policy is still a route.
         """
-        course = problem.space.with_course_share(self.policy_course_share)
-        space = course.with_margin(self._policy_margin_um(problem))
+        space = problem.space.with_reserves(self.policy_course_share, self._policy_margin_um(problem))
         px = space.um_per_px
         finest = max(math.isqrt(_LARGEST_PX // space.free.size), 1)
         finer = min(max(math.ceil(self.policy_points_per_radius / space.radius), 1), self.policy_points_per_px, finest)
-        goal = attach_goal(space, problem.goal_um)
-        target = space.pixel(goal.node) if goal.point is None else goal.point
+        target = attach_goal(space, problem.goal_um).place(space)
         speed = planning_speed_um_s(self.policy_share, problem.robot) / px
         fine = space.cost_rasters(speed, deviations * self._deviation(problem)).finer(finer)
         clearance = finer * interpolate_raster(space.clearance, finer)
@@ -127,7 +124,7 @@ class TimeField:
             return problem.margin_um
         return min(max(self.policy_margin_share * problem.margin_um, self.wall_error_um), problem.margin_um)
 
-    def _deviation(self, problem: Problem) -> NDArray[np.float64]:
+    def _deviation(self, problem: Problem) -> Floats:
         """(h, w) px/s, one standard deviation of the flow; a ratio of its speed if the field states none."""
         field, space = problem.field, problem.space
         if field.std_um_s is not None:

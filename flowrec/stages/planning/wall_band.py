@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import compiled
-from flowrec.stages.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, Mask, Raster
+from flowrec.stages.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, Ints, Mask, Raster
 
 # A lacking pixel of clearance costs this many times what a pixel takes in still fluid: then -grad T leads out of the
 # band within some 20 degrees of straight.
@@ -43,7 +42,7 @@ def extend_to_walls(times: Raster, free: Mask, clearance: Raster, need: float, s
 
 @compiled
 def _fill_band(
-    times: Raster, free: Mask, layer: NDArray[np.int64], clearance: Raster, need: float, penalty: float, torn: float
+    times: Raster, free: Mask, layer: Ints, clearance: Raster, need: float, penalty: float, torn: float
 ) -> None:
     """Set the times of the band in place; `layer` is 0 in free pixels, -1 elsewhere. Arrays have a solid border."""
     fluid = clearance > 0.0
@@ -78,9 +77,7 @@ def _fill_band(
 
 
 @compiled
-def _count_layers(
-    times: Raster, free: Mask, fluid: Mask, layer: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], int, int]:
+def _count_layers(times: Raster, free: Mask, fluid: Mask, layer: Ints) -> tuple[Ints, Ints, int, int]:
     """Number the layers of the band in place, breadth first from the free pixels beside it.
 
     Returns

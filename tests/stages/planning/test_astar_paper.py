@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from flowrec.stages.planning.astar_paper import offsets_within
 from flowrec.stages.planning.cost_rasters import CostRasters
-from flowrec.stages.planning.grid_search import PAPER, backtrack, best_first, paper_cost
+from flowrec.stages.planning.grid_search import PAPER, backtrack, best_first, offsets_within, paper_cost
 
 SIDE, SPEED = 4, 2.0
 NODES = np.array([(x, y) for y in range(SIDE) for x in range(SIDE)], float)

@@ -147,7 +147,7 @@ def test_where_um_per_rev_is_in_doubt_the_stretches_vary_the_own_motion():
         covariance = covariance_after(
             uncertainty.covariance, Looks.none(uncertainty, sampling, chip, 4.0, 0.05).information(points, times)
         )
-        uncertainty = uncertainty.with_covariance(covariance)
+        uncertainty = replace(uncertainty, covariance=covariance)
         route, start, progress = new, new.waypoints_um[-1], float(new.arrival_s[-1])
     known = uncertainty.covariance[2, 2] ** 0.5
     assert known < 0.05, "the stretches tell the robot's motion from the flow"
