@@ -113,7 +113,7 @@ def fit_log(
 
     def turns(time_s: Floats) -> Floats:
         at_ns = (time_s - begin_s) * NS_PER_S + begin_ns
-        return np.mean([log.turns_until(at_ns + each) for each in around_ns], axis=0)
+        return np.asarray(np.mean([log.turns_until(at_ns + each) for each in around_ns], axis=0), np.float64)
 
     begin_s = seconds(begin_ns)
     span_s = (begin_s, seconds(int(log.times_ns[-1])))
@@ -164,7 +164,7 @@ def _means(stamps_ns: Stamps, positions_um: Floats, window: int) -> tuple[Stamps
     whole = np.ptp(stamps, axis=1) < (window - 0.5) * image_ns  # no frame lacks within
     around_ns = (np.arange(window) - 0.5 * (window - 1)) * image_ns
     means_ns = np.rint(stamps[whole].mean(axis=1)).astype(np.int64)
-    return means_ns, places[whole].mean(axis=1), around_ns
+    return means_ns, np.asarray(places[whole].mean(axis=1)), around_ns.astype(np.float64)
 
 
 def _applied_turns(session: Session) -> tuple[Turns, tuple[float, float]]:

@@ -149,7 +149,7 @@ def _peaks(motion: _Motion, turns: Turns, span_s: tuple[float, float], rate: flo
     beside = np.pad(r2, ((0, 0), (1, 1)))
     shifts_s = first + step * np.arange(lags) - rate * motion.first_s  # offset at movie time 0
     peak = (r2 >= beside[:, :-2]) & (r2 >= beside[:, 2:])
-    return shifts_s + (rate - 1.0) * motion.middle_s, np.where(peak, r2, 0.0)
+    return np.asarray(shifts_s + (rate - 1.0) * motion.middle_s, np.float64), np.where(peak, r2, 0.0)
 
 
 def _rates(motion: _Motion, within: SearchRange) -> list[float]:

@@ -57,7 +57,7 @@ _MOST_GROWTH = 1.2  # factor by which the scale may be off, to either side
 _GROWTHS = tuple(np.geomspace(0.5, 2.0, 91).tolist())
 
 
-class _Scene:
+class _ChipInPicture:
     """A picture (h, w) and the chip that it may show."""
 
     def __init__(self, picture: Image, chip: Chip) -> None:
@@ -73,7 +73,7 @@ class _Scene:
 
 
 def _is_small(picture: Image) -> bool:
-    return min(picture.shape) < _LEAST_PX
+    return bool(min(picture.shape) < _LEAST_PX)
 
 
 def _is_blank(picture: Image) -> bool:
@@ -96,7 +96,7 @@ def register(
         raise ChipError(f"the picture has {picture.shape[1]} x {picture.shape[0]} pixels; take one of at least {least}")
     if _is_blank(picture):
         raise ChipError("the picture is blank; is the lamp on and the chip in view?")
-    scene = _Scene(picture, chip)
+    scene = _ChipInPicture(picture, chip)
     poses = scene.search.candidates(um_per_px, mirrors, _CANDIDATES)
     fitter = scene.fitter(math.sqrt(um_per_px[0] * um_per_px[1]))
     fits: list[WallFit] = []
@@ -134,7 +134,7 @@ def fit_nearby(picture: Image, chip: Chip, assumed: Calibration) -> WallFit | No
     """
     if _is_small(picture) or _is_blank(picture):
         return None
-    scene = _Scene(picture, chip)
+    scene = _ChipInPicture(picture, chip)
     grown = [AS_STATED.about(assumed, scene.middle_px, growth) for growth in _NEAR_GROWTHS]
     likely = max(grown, key=scene.search.agreement)
     near = abs(math.log(likely.um_per_px / assumed.um_per_px)) < _NEAR_SCALE
@@ -234,7 +234,7 @@ def orientation_by_image(picture: Image, chip: Chip, stated: Calibration) -> Ima
     """The verdict of a picture (h, w) on the stated registration."""
     if _is_small(picture) or _is_blank(picture):
         return ImageVerdict("", ())
-    scene = _Scene(picture, chip)
+    scene = _ChipInPicture(picture, chip)
 
     def pose(orientation: Orientation, growth: float) -> Calibration:
         return orientation.about(stated, scene.middle_px, growth)

@@ -228,7 +228,7 @@ class _Model:
         self._of_d = -np.column_stack((slope_px, turn, (slope_px * arm).sum(-1)))
         self.offset: Floats = before.offset if before is not None else np.zeros(self._count)
         self.gain: Floats = before.gain if before is not None else np.ones(self._count)
-        self._weight = np.ones(len(self._levels))
+        self._weigh(np.ones(len(self._levels)))
         for _ in range(5 if before is None else 3):
             self._improve()
 
@@ -242,7 +242,11 @@ class _Model:
         self.offset = self._mean(self._levels - b * f)
         self._rest = self._levels - self.offset[self._patch] - b * f
         scale = 1.4826 * float(np.median(np.abs(self._rest))) + 1e-9 if len(self._rest) else 1.0
-        self._weight = np.maximum(1.0 - (self._rest / (_TUKEY * scale)) ** 2, 0.0) ** 2
+        self._weigh(np.maximum(1.0 - (self._rest / (_TUKEY * scale)) ** 2, 0.0) ** 2)
+
+    def _weigh(self, weight: Floats) -> None:
+        self._weight = weight
+        self._total = self._sums(weight) + 1e-9
 
     def _gain(self, f: Floats) -> Floats:
         """(patches,) slope of the line through the grey levels of each patch over f, drawn towards 1."""
@@ -253,14 +257,14 @@ class _Model:
 
     def _solve(self, weight: Floats, values: Floats, gain: Floats) -> Floats:
         """The g at the knots that minimises sum weight / gain (values - gain g(d))^2, with a little smoothness."""
-        return np.linalg.solve(self._normal(weight * gain), self._on_knots(weight * values))
+        return np.asarray(np.linalg.solve(self._normal(weight * gain), self._on_knots(weight * values)), np.float64)
 
     def _normal(self, weight: Floats) -> Floats:
         """(knots, knots) matrix of the normal equations for g at the knots, with a little smoothness."""
         upper = weight * self._part
         both = upper * self._part
         # (1 - part)^2, part^2 and part (1 - part) from the sums of 1, part and part^2 between two knots.
-        one, first, second = (np.bincount(self._low, each, _ALL_KNOTS) for each in (weight, upper, both))
+        one, first, second = (_sums(self._low, each, _ALL_KNOTS) for each in (weight, upper, both))
         diagonal = one - 2.0 * first + second
         diagonal[1:] += second[:-1]
         beside = (first - second)[:-1]
@@ -270,8 +274,8 @@ class _Model:
 
     def _on_knots(self, values: Floats) -> Floats:
         """(knots,) sums of values (n,), of which each knot gets its share."""
-        upper = np.bincount(self._low, self._part * values, _ALL_KNOTS)
-        found = np.bincount(self._low, values, _ALL_KNOTS) - upper
+        upper = _sums(self._low, self._part * values, _ALL_KNOTS)
+        found = _sums(self._low, values, _ALL_KNOTS) - upper
         found[1:] += upper[:-1]
         return found
 
@@ -280,11 +284,11 @@ class _Model:
 
     def _sums(self, values: Floats) -> Floats:
         """(patches,) sums of values (n,) over the patches."""
-        return np.bincount(self._patch, values, self._count)
+        return _sums(self._patch, values, self._count)
 
     def _mean(self, values: Floats) -> Floats:
         """Weighted mean (patches,) of the values of each patch."""
-        return self._sums(self._weight * values) / (self._sums(self._weight) + 1e-9)
+        return self._sums(self._weight * values) / self._total
 
     @property
     def explained(self) -> float:
@@ -298,7 +302,8 @@ class _Model:
     def _of_motion(self) -> Floats:
         """(n,) derivative of b f(d) by d."""
         slope = np.gradient(self._profile) * _KNOTS / self._reach_um
-        return self.gain[self._patch] * self._at(slope)
+        of_d: Floats = self.gain[self._patch] * self._at(slope)
+        return of_d
 
     def _jacobian(self) -> tuple[Floats, Floats]:
         """(n, 4) derivatives of b f(d) by the motion, without what other f, a and b could explain; normal matrix."""
@@ -347,7 +352,7 @@ class _Model:
         found = usable & (like > _LIKE)
         share = float(length[found].sum() / max(length[usable].sum(), 1e-9))
         of_d = self._of_motion()
-        square, moved = (np.bincount(wall, of_d * self._weight * each, walls) for each in (of_d, self._rest))
+        square, moved = (_sums(wall, of_d * self._weight * each, walls) for each in (of_d, self._rest))
         off_um = moved / np.maximum(square, 1e-12)
         weights = length * found
         residual = math.sqrt(float(np.sum(weights * off_um**2) / max(weights.sum(), 1e-9)))
@@ -358,10 +363,15 @@ class _Model:
         return share, residual, inverse @ (parts.T @ parts) @ inverse
 
 
+def _sums(places: Indices, values: Floats, count: int) -> Floats:
+    """(count,) sums of the values (n,) at each place."""
+    return np.asarray(np.bincount(places, values, count), np.float64)
+
+
 def _correlation(a: Floats, b: Floats, weight: Indices) -> Floats:
     """Weighted correlation of the rows of a and b."""
     total = np.maximum(weight.sum(1, keepdims=True), 1)
     a = a - (weight * a).sum(1, keepdims=True) / total
     b = b - (weight * b).sum(1, keepdims=True) / total
     both = np.sqrt((weight * a * a).sum(1) * (weight * b * b).sum(1))
-    return (weight * a * b).sum(1) / np.maximum(both, 1e-12)
+    return np.asarray((weight * a * b).sum(1) / np.maximum(both, 1e-12))

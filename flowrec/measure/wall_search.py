@@ -77,9 +77,9 @@ class WallMap:
     def lines(self) -> tuple[Floats, Floats]:
         """Points (n, 2) on the walls in px of the mask, as (column, row), and the unit normals (n, 2) there."""
         clearance_px = self.clearance_um / np.float32(self.um_per_px)
-        down, right = np.gradient(clearance_px.astype(np.float64))
+        down, right = (np.asarray(slope, np.float64) for slope in np.gradient(clearance_px.astype(np.float64)))
         size = np.asarray(np.hypot(right, down))
-        near = (np.abs(clearance_px) <= 0.75) & (size > 0.3)
+        near: Mask = np.asarray((np.abs(clearance_px) <= 0.75) & (size > 0.3))
         near[[0, -1]] = near[:, [0, -1]] = False
         rows, columns = np.nonzero(near)
         normals = np.stack((right[near], down[near]), -1) / size[near][:, None]

@@ -95,7 +95,7 @@ class ZarrMovie(Movie):
         return plane
 
 
-class _Found(NamedTuple):
+class _FinestLevel(NamedTuple):
     """An array, and what the metadata beside it say; None: they do not."""
 
     array: Any
@@ -105,10 +105,10 @@ class _Found(NamedTuple):
     ome: OmeFacts = OmeFacts()
 
 
-def _find_array(path: Path) -> _Found:
+def _find_array(path: Path) -> _FinestLevel:
     node = zarr.open(str(path), mode="r")
     if isinstance(node, zarr.Array):
-        return _Found(node, _default_axes(node))
+        return _FinestLevel(node, _default_axes(node))
     attributes = _ome_attributes(node)
     if "multiscales" not in attributes and "0" in node and isinstance(node["0"], zarr.Group):
         node = node["0"]  # bioformats2raw
@@ -134,7 +134,7 @@ def _find_array(path: Path) -> _Found:
     second, um = seconds_per(units[axes.index("t")]) if "t" in axes else None, um_per(units[-1])
     xml = path / _XML
     text = xml.read_text(encoding="utf-8", errors="replace") if xml.is_file() else ""
-    return _Found(
+    return _FinestLevel(
         array,
         axes,
         interval_s=None if second is None else float(factors[axes.index("t")]) * second,
