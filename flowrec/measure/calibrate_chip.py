@@ -14,7 +14,7 @@ from typing import Any, cast, get_args
 import cv2
 
 from flowrec.core import ChipError, UsageError, __version__, say, table
-from flowrec.measure.images import Colours, Mask, outlined
+from flowrec.measure.images import Colours, Mask, with_curves
 from flowrec.measure.pictures import SourcePicture, png_of, read_picture
 from flowrec.measure.proposal import check_outputs, write_outputs
 from flowrec.measure.segmentation import Segmentation, Shown, chip_mask, segment
@@ -67,12 +67,12 @@ class PictureChip:
 
     @property
     def unit(self) -> str:
-        """Of lengths: um, or pixels of the picture."""
+        """The unit of lengths: um, or pixels of the picture."""
         return "px" if self.um_per_px is None else "um"
 
     @property
     def pixel_size(self) -> float:
-        """Of the mask, in `unit`."""
+        """Size of a pixel of the mask, in `unit`."""
         return self.pixel * (self.um_per_px or 1.0)
 
     @property
@@ -270,7 +270,7 @@ def _point(text: str) -> tuple[float, float]:
 
 def draw_outline(done: PictureChip) -> Colours:
     """The picture (h, w, 3), blue first, with the outline in orange and the openings with their names."""
-    image, wide = outlined(done.picture.image, done.found.outline.curves)
+    image, wide = with_curves(done.picture.image, done.found.outline.curves)
     height, width = image.shape[:2]
     for name, o, kind in done.named_openings:
         across = o.side in ("left", "right")

@@ -65,7 +65,7 @@ def fill_curves(canvas: NDArray[np.uint8], curves: Iterable[Floats]) -> None:
     cv2.fillPoly(canvas, as_points(curves), 255, cv2.LINE_8, _SHIFT)
 
 
-def outlined(picture: Image, curves: Iterable[Floats]) -> tuple[Colours, int]:
+def with_curves(picture: Image, curves: Iterable[Floats]) -> tuple[Colours, int]:
     """A picture (h, w, 3), blue first, with closed curves in orange, and the width of their lines in px."""
     grey = picture.astype(np.float32)
     low, high = np.percentile(grey, (0.5, 99.5))

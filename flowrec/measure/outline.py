@@ -200,7 +200,7 @@ def _area(curve: Floats) -> float:
     return 0.5 * abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))))
 
 
-def _padded(mask: Mask) -> NDArray[np.uint8]:
+def _pad(mask: Mask) -> NDArray[np.uint8]:
     return np.pad(mask, _PAD_PX, mode="edge").astype(np.uint8)
 
 
@@ -212,7 +212,7 @@ def typical_width_px(mask: Mask) -> float:
     """Width of the channel that is exceeded along three quarters of its length."""
     if not mask.any() or mask.all():
         return float(max(mask.shape))
-    distance = _distance(_padded(mask))
+    distance = _distance(_pad(mask))
     crest = (distance >= cv2.dilate(distance, np.ones((3, 3), np.uint8))) & (distance > 0.9)
     inner = (slice(_PAD_PX, -_PAD_PX),) * 2
     values = distance[inner][crest[inner]]
@@ -221,12 +221,12 @@ def typical_width_px(mask: Mask) -> float:
 
 def _level(mask: Mask) -> Levels:
     """Smooth signed distance (h, w) in pixels, padded, positive in fluid."""
-    padded = _padded(mask)
+    padded = _pad(mask)
     return blur_image(np.where(padded > 0, _distance(padded) - 0.5, 0.5 - _distance(1 - padded)), 1.2)
 
 
 def _contours(mask: Mask) -> list[Floats]:
-    contours, _ = cv2.findContours(_padded(mask), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    contours, _ = cv2.findContours(_pad(mask), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     return [contour[:, 0].astype(np.float64) - _PAD_PX for contour in contours if len(contour) >= 12]
 
 

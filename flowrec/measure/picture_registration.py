@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from flowrec.core import ChipError, Image
-from flowrec.measure.images import Colours, Mask, outlined
+from flowrec.measure.images import Colours, Mask, with_curves
 from flowrec.measure.wall_fit import Fitter, WallFit
 from flowrec.measure.wall_search import WallMap, WallSearch
 from flowrec.physics import (
@@ -196,7 +196,7 @@ def _refuse_undetermined(fit: WallFit, chip: Chip) -> None:
 def overlay(picture: Image, chip: Chip, calibration: Calibration) -> Colours:
     """The picture (h, w, 3), blue first, with the outline of the chip as it was found, in orange."""
     contours, _ = cv2.findContours(chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    return outlined(picture, (calibration.to_px(contour[:, 0] * chip.um_per_px) for contour in contours))[0]
+    return with_curves(picture, (calibration.to_px(contour[:, 0] * chip.um_per_px) for contour in contours))[0]
 
 
 @dataclass(frozen=True, slots=True)
