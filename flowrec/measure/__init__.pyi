@@ -10,5 +10,5 @@ from .calibrate_motion import (
     heading_settings as heading_settings, remarks as remarks, rows_of as rows_of, sampled_s as sampled_s,
 )
 from .motion_fit import MotionFit as MotionFit, UNEXPLAINED as UNEXPLAINED
-from .picture_orientation import ImageVerdict as ImageVerdict, orientation_by_image as orientation_by_image
+from .picture_registration import ImageVerdict as ImageVerdict, orientation_by_image as orientation_by_image
 from .tuning import tune as tune

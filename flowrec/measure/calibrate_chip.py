@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import PICTURE, TOML, ChipError, Output, UsageError, __version__, say, table
+from flowrec.core import ChipError, UsageError, __version__, say, table
+from flowrec.measure.images import Colours, Mask, with_curves
 from flowrec.measure.pictures import SourcePicture, png_of, read_picture
+from flowrec.measure.proposal import check_outputs, write_outputs
 from flowrec.measure.segmentation import Segmentation, Shown, chip_mask, segment
 from flowrec.physics import (
     WATER_KG_M3,
@@ -33,7 +32,8 @@ from flowrec.physics import (
     set_inlet_speed,
 )
 
-_OUTLINE, _INLET, _OTHER = (0, 140, 255), (0, 200, 0), (0, 0, 255)  # blue, green, red
+_INLET, _OTHER = (0, 200, 0), (0, 0, 255)  # blue, green, red
+_OVERLAY = "_overlay.png"  # end of its name, beside the mask's
 _SHOWN = {
     "dark": "dark lines",
     "bright": "bright lines",
@@ -57,13 +57,33 @@ class PictureChip:
 
     picture: SourcePicture
     found: Segmentation
-    mask: NDArray[np.bool_]
+    mask: Mask
     pixel: float
     um_per_px: float | None
     openings: tuple[Opening, ...]
     inlets_known: bool
     speed_um_s: float | None
     wall_shift_um: float
+
+    @property
+    def unit(self) -> str:
+        """The unit of lengths: um, or pixels of the picture."""
+        return "px" if self.um_per_px is None else "um"
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a pixel of the mask, in `unit`."""
+        return self.pixel * (self.um_per_px or 1.0)
+
+    @property
+    def named_openings(self) -> list[tuple[str, Opening, str | None]]:
+        """The openings with their names, and their kinds where those are known."""
+        names = opening_names(self.openings)
+        return [(name, o, o.kind if self.inlets_known else None) for name, o in zip(names, self.openings, strict=True)]
+
+    def chip(self, name: str) -> Chip:
+        """The chip with assumptions in place of what is not known."""
+        return Chip(name, self.mask, self.pixel_size, self.openings, WATER_MPA_S, WATER_KG_M3)
 
 
 def calibrate_chip(
@@ -103,7 +123,7 @@ def calibrate_chip(
     if wall_shift_um and (um_per_px is None or not math.isfinite(wall_shift_um)):
         raise UsageError(f"--wall-shift {wall_shift_um:g}: it is in um, so give --um-per-px, too")
     seeds = [_point(text) for text in seed_points]
-    outputs = _outputs(out, path, overwrite)
+    outputs = check_outputs(out, (path,), overwrite, (".png", _OVERLAY))
     picture = read_picture(path, channel)
     try:
         found = segment(picture.image, cast(Shown, walls), seeds)
@@ -126,35 +146,11 @@ def calibrate_chip(
     if inlet_speed_um_s is not None:
         openings = set_inlet_speed(openings, inlet_speed_um_s)
     done = PictureChip(picture, found, mask, pixel, um_per_px, openings, bool(inlets), inlet_speed_um_s, wall_shift_um)
-    check_chip(_chip(done, path.stem), str(path))
+    check_chip(done.chip(path.stem), str(path))
     if out is not None:
-        settings, png, drawing = outputs
-        with ExitStack() as files:  # the last one gets its name first: without the TOML the mask is no chip
-            parts = [files.enter_context(each.new_file()) for each in (settings, png, drawing)]
-            parts[0].write_text(chip_toml(done, out.stem), encoding="utf-8")
-            parts[1].write_bytes(chip_files(_chip(done, out.stem))[0])
-            parts[2].write_bytes(png_of(draw_outline(done)))
+        mask_png, _ = chip_files(done.chip(out.stem))
+        write_outputs(outputs, (chip_toml(done, out.stem).encode(), mask_png, png_of(draw_outline(done))))
     return done
-
-
-def _outputs(out: Path | None, path: Path, overwrite: bool) -> tuple[Output, ...]:
-    if out is None:
-        return ()
-    names = (out, TOML), (out.with_suffix(PICTURE[0]), PICTURE), (overlay_name(out), PICTURE)
-    outputs = tuple(Output(name, kind, (path,), overwrite) for name, kind in names)
-    for output in outputs:
-        output.check()
-    return outputs
-
-
-def overlay_name(out: Path) -> Path:
-    """The overlay's name, beside the mask's."""
-    return out.with_name(f"{out.stem}_overlay{PICTURE[0]}")
-
-
-def _chip(done: PictureChip, name: str) -> Chip:
-    um = (done.um_per_px or 1.0) * done.pixel
-    return Chip(name, done.mask, um, done.openings, WATER_MPA_S, WATER_KG_M3)
 
 
 def chip_toml(done: PictureChip, name: str) -> str:
@@ -162,14 +158,14 @@ def chip_toml(done: PictureChip, name: str) -> str:
     lines = [
         f"# By flowrec {__version__} calibrate chip from {done.picture.source} (sha256 {done.picture.sha256}).",
         f"# {verdict(done)}",
-        f"# {name}_overlay.png shows the outline. {name}.png is the mask: white is fluid, black is chip. Correct it",
+        f"# {name}{_OVERLAY} shows the outline. {name}.png is the mask: white is fluid, black is chip. Correct it",
         "# in any paint program, at its size. Where that moves an opening, correct its first and last pixel below.",
     ]
     what = "a pixel of the mask" if done.pixel == 1.0 else f"a pixel of the mask, {done.pixel:g} pixels of the picture"
     if done.um_per_px is None:
         lines.append(f"# um_per_px =   # FILL IN: um, {what}")
     else:
-        lines.append(f"um_per_px = {float(f'{done.um_per_px * done.pixel:.7g}')!r}  # {what}")
+        lines.append(f"um_per_px = {float(f'{done.pixel_size:.7g}')!r}  # {what}")
     lines += [
         f"viscosity_mpa_s = {WATER_MPA_S!r}  # of water",
         f"density_kg_m3 = {WATER_KG_M3!r}  # of water",
@@ -177,17 +173,14 @@ def chip_toml(done: PictureChip, name: str) -> str:
         'walls = "smooth"',
         'fluid = "bright"',
     ]
-    for opening, o in zip(opening_names(done.openings), done.openings, strict=True):
+    for opening, o, kind in done.named_openings:
         lines += ["", f"[[opening]]  # {opening}", f'side = "{o.side}"', f"first = {o.first}", f"last = {o.last}"]
-        if not done.inlets_known:
-            lines.append('kind = "?"  # FILL IN: inlet or outlet')
-        else:
-            lines.append(f'kind = "{o.kind}"')
-        if done.inlets_known and o.kind == "outlet":
+        lines.append(f'kind = "{kind}"' if kind else 'kind = "?"  # FILL IN: inlet or outlet')
+        if kind == "outlet":
             lines.append("pressure_pa = 0.0")
         elif done.speed_um_s is None:
             lines.append("# speed_um_s =   # FILL IN for an inlet: mean inward speed, um/s")
-        elif done.inlets_known:
+        elif kind:
             lines.append(f"speed_um_s = {o.value!r}  # mean")
         else:
             lines.append(f"# speed_um_s = {done.speed_um_s!r}  # mean; only of an inlet")
@@ -197,14 +190,14 @@ def chip_toml(done: PictureChip, name: str) -> str:
 def verdict(done: PictureChip) -> str:
     """Confidence in the channel, in one line."""
     found = done.found
-    o, unit = found.outline, done.um_per_px or 1.0
-    name = "um" if done.um_per_px is not None else "px"
+    o = found.outline
     text = (
         f"Walls show as {_SHOWN[found.shown]}: {100 * o.support:.0f} % of the outline looks so, "
         f"{100 * max(o.explained, 0.0):.0f} % of the edges in the picture lie on it"
     )
     if found.shown != "step":
-        text += f"; lines are {o.line_px * unit:.2g} {name} wide, and the wall is taken to be in their middle"
+        wide = f"{o.line_px * (done.um_per_px or 1.0):.2g} {done.unit}"
+        text += f"; lines are {wide} wide, and the wall is taken to be in their middle"
     if done.wall_shift_um:
         text += f"; walls were moved outwards by {done.wall_shift_um:g} um"
     return text
@@ -234,13 +227,13 @@ def remarks(done: PictureChip) -> list[str]:
 def figures(done: PictureChip) -> dict[str, Any]:
     """The chip as plain numbers."""
     openings = [
-        {"name": name, "side": o.side, "first": o.first, "last": o.last, "kind": o.kind if done.inlets_known else None}
-        for name, o in zip(opening_names(done.openings), done.openings, strict=True)
+        {"name": name, "side": o.side, "first": o.first, "last": o.last, "kind": kind}
+        for name, o, kind in done.named_openings
     ]
     return {
         "walls": done.found.shown,
         **{key: round(value, 4) for key, value in done.found.figures.items()},
-        "um_per_px": None if done.um_per_px is None else done.um_per_px * done.pixel,
+        "um_per_px": None if done.um_per_px is None else done.pixel_size,
         "mask_px": [done.mask.shape[1], done.mask.shape[0]],
         "fluid_share": round(float(done.mask.mean()), 4),
         "openings": openings,
@@ -251,19 +244,18 @@ def figures(done: PictureChip) -> dict[str, Any]:
 
 def show(done: PictureChip, out: Path | None) -> None:
     """Print the openings as a table, the verdict, the files, and what a person must do."""
-    unit = done.pixel * (done.um_per_px or 1.0)
     rows = [
-        (name, f"{o.first}-{o.last}", f"{o.width_px * unit:.4g}", o.kind if done.inlets_known else "?")
-        for name, o in zip(opening_names(done.openings), done.openings, strict=True)
+        (name, f"{o.first}-{o.last}", f"{o.width_px * done.pixel_size:.4g}", kind or "?")
+        for name, o, kind in done.named_openings
     ]
     height, width = done.mask.shape
     title = (
         f"Channel in {done.picture.source}: mask of {width} x {height} px, {100 * float(done.mask.mean()):.1f} % fluid"
     )
-    table(title, ("opening", "pixels", f"width ({'um' if done.um_per_px else 'px'})", "kind"), rows)
+    table(title, ("opening", "pixels", f"width ({done.unit})", "kind"), rows)
     say(verdict(done))
     if out is not None:
-        say(f"{out}, {out.stem}.png (mask) and {overlay_name(out).name} written: look at the overlay, correct the mask")
+        say(f"{out}, {out.stem}.png (mask) and {out.stem}{_OVERLAY} written: look at the overlay, correct the mask")
     for line in remarks(done):
         say(line)
 
@@ -276,24 +268,18 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def draw_outline(done: PictureChip) -> NDArray[np.uint8]:
+def draw_outline(done: PictureChip) -> Colours:
     """The picture (h, w, 3), blue first, with the outline in orange and the openings with their names."""
-    grey = done.picture.image.astype(np.float32)
-    low, high = np.percentile(grey, (0.5, 99.5))
-    shown = np.clip(255.0 * (grey - low) / max(float(high - low), 1.0), 0, 255).astype(np.uint8)
-    image = np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR), np.uint8)
-    height, width = grey.shape
-    wide = max(1, round(max(height, width) / 800))
-    for curve in done.found.outline.curves:
-        cv2.polylines(image, [np.rint(16 * curve).astype(np.int32)], True, _OUTLINE, wide, cv2.LINE_AA, 4)
-    for name, o in zip(opening_names(done.openings), done.openings, strict=True):
+    image, wide = with_curves(done.picture.image, done.found.outline.curves)
+    height, width = image.shape[:2]
+    for name, o, kind in done.named_openings:
         across = o.side in ("left", "right")
         side_px, of_mask = (height, done.mask.shape[0]) if across else (width, done.mask.shape[1])
         off = 0.5 * (side_px - of_mask * done.pixel)
         first, last = (round(off + end * done.pixel) for end in (o.first, o.last + 1))
         far = {"left": 0, "top": 0, "right": width - 1, "bottom": height - 1}[o.side]
         ends = [(far, end) if across else (end, far) for end in (first, last)]
-        colour = _INLET if done.inlets_known and o.kind == "inlet" else _OTHER
+        colour = _INLET if kind == "inlet" else _OTHER
         cv2.line(image, ends[0], ends[1], colour, 4 * wide)
         size = 0.5 * wide
         (text_px, tall), _ = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, size, wide)

@@ -7,13 +7,11 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from flowrec.core import TOML, Coverage, Output, __version__, say, table
-from flowrec.measure.coil_calibration import CoilFit, advice, fit_coils, read_excitations
+from flowrec.core import Coverage, __version__, say, table
+from flowrec.measure.coil_calibration import CoilFit, Floats, advice, fit_coils, read_excitations
+from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outputs
 from flowrec.stages import Coils
 
-_AXES = ("x", "y", "z")
 _EXACT_DIGITS = 9
 
 
@@ -25,14 +23,12 @@ def calibrate_coils(path: Path, out: Path | None = None, overwrite: bool = False
     UsageError : the table can not be read or has too few rows, or no run could use such coils.
     OutputError : `out` may not be written, see `Output.check`.
     """
-    output = Output(out, TOML, (path,), overwrite) if out is not None else None
-    if output is not None:
-        output.check()
+    outputs = check_outputs(out, (path,), overwrite)
     fit = fit_coils(read_excitations(path))
-    Coils(mt_per_a=_matrix(fit), bias_mt=_bias(fit)).check(path.name)
-    if output is not None:
-        with output.new_file() as part:
-            part.write_text(fragment(fit, path), encoding="utf-8")
+    settings = settings_of(fit)
+    Coils(mt_per_a=settings["coils.mt_per_a"], bias_mt=settings["coils.bias_mt"]).check(path.name)
+    if outputs:
+        write_outputs(outputs, (fragment(fit, path).encode(),))
     return fit
 
 
@@ -41,19 +37,18 @@ def fragment(fit: CoilFit, path: Path) -> str:
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     noise = ", ".join(f"{value:.2g}" for value in fit.noise_mt)
     suspects = f"; {len(fit.suspects)} of them suspicious" if fit.suspects else ""
-    rows = "".join(f"    {list(row)},\n" for row in _matrix(fit))
-    return (
-        f"# By flowrec {__version__} calibrate coils from {path.name} (sha256 {digest}...): "
-        f"{len(fit.residual_mt)} excitations{suspects}.\n"
-        f"# Residual rms {noise} mT in x, y, z; a field of 4 mT is known to {fit.uncertainty_mt:.2g} mT.\n"
-        f"[coils]\nmt_per_a = [\n{rows}]\nbias_mt = {list(_bias(fit))}\n"
+    comments = (
+        f"By flowrec {__version__} calibrate coils from {path.name} (sha256 {digest}...): "
+        f"{len(fit.residual_mt)} excitations{suspects}.",
+        f"Residual rms {noise} mT in x, y, z; a field of 4 mT is known to {fit.uncertainty_mt:.2g} mT.",
     )
+    return as_toml(comments, settings_of(fit))
 
 
-def as_sets(fit: CoilFit) -> list[str]:
-    """The calibration as values of --set, to go with any configuration."""
-    matrix = [list(row) for row in _matrix(fit)]
-    return [f"coils.mt_per_a={matrix}", f"coils.bias_mt={list(_bias(fit))}"]
+def settings_of(fit: CoilFit) -> dict[str, Any]:
+    """The settings by key, to some hundredths of their standard errors."""
+    matrix = tuple(_round_to_error(row, std) for row, std in zip(fit.mt_per_a, fit.mt_per_a_std, strict=True))
+    return {"coils.mt_per_a": matrix, "coils.bias_mt": _round_to_error(fit.bias_mt, fit.bias_std_mt)}
 
 
 def figures(fit: CoilFit) -> dict[str, Any]:
@@ -68,8 +63,8 @@ def figures(fit: CoilFit) -> dict[str, Any]:
         "bias_mt": fit.bias_mt.tolist(),
         "bias_standard_error_mt": fit.bias_std_mt.tolist(),
         "residual_rms_mt": fit.noise_mt.tolist(),
-        "worst_line": [lines[row] for row in np.abs(fit.residual_mt).argmax(0)],
-        "worst_residual_mt": [_largest(column) for column in fit.residual_mt.T],
+        "worst_line": [lines[row] for row in fit.worst],
+        "worst_residual_mt": [float(fit.residual_mt[row, axis]) for axis, row in enumerate(fit.worst)],
         "left_out_mt": [[None if math.isnan(v) else v for v in row] for row in fit.left_out_mt.tolist()],
         "suspicious_lines": [lines[row] for row in fit.suspects],
         "unchecked_lines": [lines[row] for row in fit.unchecked],
@@ -78,7 +73,7 @@ def figures(fit: CoilFit) -> dict[str, Any]:
         "weakest_mt_per_a": strength,
         "standard_error_of_4_mt": fit.uncertainty_mt,
         "advice": advice(fit),
-        "set": as_sets(fit),
+        "set": as_sets(settings_of(fit)),
         "covered": Coverage(len(lines), len(lines), "rows").as_json(),
     }
 
@@ -87,8 +82,7 @@ def show(fit: CoilFit, out: Path | None) -> None:
     """Print the fit as a table."""
     lines = fit.excitations.lines
     rows = []
-    for axis, name in enumerate(_AXES):
-        worst = int(np.abs(fit.residual_mt[:, axis]).argmax())
+    for axis, (name, worst) in enumerate(zip("xyz", fit.worst, strict=True)):
         rows.append(
             (
                 f"b_{name}",
@@ -113,19 +107,10 @@ def show(fit: CoilFit, out: Path | None) -> None:
         say(f"- {sentence}")
     if out is not None:
         say(f"{out} written: flowrec record {out}")
-    say("With any configuration: " + " ".join(f"--set '{text}'" for text in as_sets(fit)))
+    say("With any configuration: " + " ".join(f"--set '{text}'" for text in as_sets(settings_of(fit))))
 
 
-def _matrix(fit: CoilFit) -> Any:
-    return tuple(_round_to_error(row, std) for row, std in zip(fit.mt_per_a, fit.mt_per_a_std, strict=True))
-
-
-def _bias(fit: CoilFit) -> Any:
-    return _round_to_error(fit.bias_mt, fit.bias_std_mt)
-
-
-def _round_to_error(values: Any, stds: Any) -> Any:
-    """To some hundredths of the standard error."""
+def _round_to_error(values: Floats, stds: Floats) -> tuple[float, ...]:
     return tuple(round(float(v), _digits(s) + 2) + 0.0 for v, s in zip(values, stds, strict=True))
 
 
@@ -138,7 +123,3 @@ def _with_doubt(value: float, std: float) -> str:
 def _digits(std: float) -> int:
     """Number of decimals that show the first digit of a standard error."""
     return min(max(-math.floor(math.log10(std)), 0), _EXACT_DIGITS) if std > 0.0 else _EXACT_DIGITS
-
-
-def _largest(values: Any) -> float:
-    return float(values[np.abs(values).argmax()])

@@ -9,9 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flowrec.core import PICTURE, TOML, ChipError, Image, Output, UsageError, __version__, say, table
+from flowrec.core import ChipError, Image, UsageError, __version__, say, table
 from flowrec.measure.picture_registration import fit_nearby, moved_px, other_scale, overlay, register
 from flowrec.measure.pictures import SourcePicture, png_of, read_picture
+from flowrec.measure.proposal import as_toml, check_outputs, write_outputs
 from flowrec.measure.wall_fit import WallFit
 from flowrec.physics import Calibration, Chip, chip_key, compute_cached, load_chip
 from flowrec.stages import CameraSettings, Config
@@ -20,6 +21,7 @@ _ABOUT = 1.12  # camera.um_per_px, where it is given, is right up to this factor
 _UNKNOWN = 2.0  # the same of the scale at which the chip fills the image
 _STALE_DAYS = 30.0
 _POOR_PX = 1.0  # residual
+_ADVICE = "flowrec calibrate image PICTURE -o registration.toml measures it"
 _MOVED_PX = 1.0  # of the walls; a hundred times the error of a fit to good pictures, ten times that to poor ones
 
 
@@ -57,38 +59,27 @@ def calibrate_image(
     ------
     FlowrecError : one line: the picture can not be read, does not show the chip, or the outputs may not be written.
     """
-    outputs = _outputs(out, (path, *inputs), overwrite)
+    outputs = check_outputs(out, (path, *inputs), overwrite, (".png",))
     picture = read_picture(path, config.movie.channel)
     chip = load_chip(config.chip)
     height, width = picture.image.shape
-    about_um = config.camera.um_per_px
-    factor = _ABOUT if about_um is not None else _UNKNOWN
-    about_um = about_um if about_um is not None else max(chip.size_um[0] / width, chip.size_um[1] / height)
+    about_um, factor = config.camera.um_per_px, _ABOUT
+    if about_um is None:
+        about_um, factor = max(chip.size_um[0] / width, chip.size_um[1] / height), _UNKNOWN
     mirrors = (False, True) if mirror is None else (mirror,)
     try:
         poses = register(picture.image, chip, (about_um / factor, about_um * factor), mirrors)
     except ChipError as error:
         raise ChipError(f"{path}: {error}") from error
     if pick is not None and not 1 <= pick <= len(poses):
-        raise UsageError(f"--pick {pick}: there {_are(len(poses))}; choose from 1 to {len(poses)}")
+        are = "is one pose" if len(poses) == 1 else f"are {len(poses)} poses"
+        raise UsageError(f"--pick {pick}: there {are}; choose from 1 to {len(poses)}")
     chosen = poses[pick - 1] if pick is not None else poses[0] if len(poses) == 1 else None
     done = ImageRegistration(picture, chip, poses, chosen, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"))
-    if outputs is not None and chosen is not None:
-        settings, drawing = outputs
-        with drawing.new_file() as part:
-            part.write_bytes(png_of(overlay(picture.image, chip, chosen.calibration)))
-        with settings.new_file() as part:
-            part.write_text(fragment(done, chosen), encoding="utf-8")
+    if outputs and chosen is not None:
+        drawing = png_of(overlay(picture.image, chip, chosen.calibration))
+        write_outputs(outputs, (fragment(done, chosen).encode(), drawing))
     return done
-
-
-def _outputs(out: Path | None, inputs: tuple[Path, ...], overwrite: bool) -> tuple[Output, Output] | None:
-    if out is None:
-        return None
-    outputs = Output(out, TOML, inputs, overwrite), Output(out.with_suffix(PICTURE[0]), PICTURE, inputs, overwrite)
-    for output in outputs:
-        output.check()
-    return outputs
 
 
 def settings_of(done: ImageRegistration, fit: WallFit) -> dict[str, Any]:
@@ -113,14 +104,14 @@ def settings_of(done: ImageRegistration, fit: WallFit) -> dict[str, Any]:
 def fragment(done: ImageRegistration, fit: WallFit) -> str:
     """The settings as TOML, with a comment on their quality."""
     x, y, angle, scale = fit.std.tolist()
-    lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in settings_of(done, fit).items())
-    return (
-        f"# By flowrec {__version__} calibrate image from {done.picture.source} (sha256 {done.picture.sha256}),\n"
-        f"# chip {done.chip.name}: {100 * fit.found:.0f} % of the walls in the picture agree, {100 * fit.seen:.0f} % "
-        f"of the chip's walls are in it.\n"
-        f"# Standard errors: {max(x, y):.2g} um, {angle:.2g} degrees, {100 * scale:.2g} %.\n"
-        f"[camera]\n{lines}"
+    source = done.picture
+    comments = (
+        f"By flowrec {__version__} calibrate image from {source.source} (sha256 {source.sha256}),",
+        f"chip {done.chip.name}: {100 * fit.found:.0f} % of the walls in the picture agree, {100 * fit.seen:.0f} % of "
+        "the chip's walls are in it.",
+        f"Standard errors: {max(x, y):.2g} um, {angle:.2g} degrees, {100 * scale:.2g} %.",
     )
+    return as_toml(comments, {f"camera.{key}": value for key, value in settings_of(done, fit).items()})
 
 
 def figures(done: ImageRegistration) -> dict[str, Any]:
@@ -174,22 +165,21 @@ def show(done: ImageRegistration, out: Path | None) -> None:
 
 def registration_state(camera: CameraSettings, now: datetime | None = None) -> tuple[bool, str]:
     """Age and quality of the registration of a camera: True if both are good, and one line on it, for people."""
-    advice = "flowrec calibrate image PICTURE -o registration.toml measures it"
     if not camera.registered_on:
-        return False, f"the registration of camera and chip was never measured; {advice}"
+        return False, f"the registration of camera and chip was never measured; {_ADVICE}"
     try:
         made = datetime.fromisoformat(camera.registered_on)
     except ValueError:
-        return False, f"camera.registered_on = {camera.registered_on!r} is no date; {advice}"
+        return False, f"camera.registered_on = {camera.registered_on!r} is no date; {_ADVICE}"
     made = made if made.tzinfo is not None else made.replace(tzinfo=UTC)
     days = ((now or datetime.now(UTC)) - made).total_seconds() / 86_400.0
-    residual = "" if camera.residual_um is None else f", residual {camera.residual_um:.2g} um"
+    residual_um = camera.residual_um
+    residual = "" if residual_um is None else f", residual {residual_um:.2g} um"
     text = f"registered {max(days, 0.0):.0f} days ago from {camera.registered_from or 'an unnamed picture'}{residual}"
     if days > _STALE_DAYS:
-        return False, f"{text}; {advice} again"
-    um_per_px = camera.um_per_px
-    if camera.residual_um is not None and um_per_px is not None and camera.residual_um > _POOR_PX * um_per_px:
-        return False, f"{text}, more than a pixel; does the mask fit the chip? {advice} again"
+        return False, f"{text}; {_ADVICE} again"
+    if residual_um is not None and camera.um_per_px is not None and residual_um > _POOR_PX * camera.um_per_px:
+        return False, f"{text}, more than a pixel; does the mask fit the chip? {_ADVICE} again"
     return True, text
 
 
@@ -221,15 +211,10 @@ def walls_state(image: Image, chip: Chip, assumed: Calibration) -> WallsState | 
             f"chip at {um_per_px:.5g} ± {error:.1g}: set camera.um_per_px = {um_per_px:.5g}, if the mask has the right "
             "size"
         )
-        return WallsState(good=False, text=text, other_scale=True)
+        return WallsState(False, text, other_scale=True)
     moved = moved_px(fit, chip, assumed)
     if moved is None:
         return None
     text = f"the walls in the image are {moved:.2g} px from where the registration puts them"
-    if moved > _MOVED_PX:
-        return WallsState(good=False, text=f"{text}; flowrec calibrate image PICTURE -o registration.toml measures it")
-    return WallsState(good=True, text=text)
-
-
-def _are(count: int) -> str:
-    return "is one pose" if count == 1 else f"are {count} poses"
+    good = moved <= _MOVED_PX
+    return WallsState(good, text if good else f"{text}; {_ADVICE}")

@@ -4,33 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import (
-    NS_PER_S,
-    TOML,
-    Applied,
-    Coverage,
-    Currents,
-    FlowField,
-    Output,
-    Track,
-    UsageError,
-    __version__,
-    say,
-    seconds,
-    table,
-)
+from flowrec.core import NS_PER_S, Coverage, Currents, FlowField, UsageError, __version__, say, seconds, table
 from flowrec.measure.motion_fit import LEAST_EXPLAINED_WITH_RATE, LEAST_FRAMES, MotionFit, fit_motion, refusal_of
+from flowrec.measure.motion_regression import Turns
 from flowrec.measure.motion_search import SearchRange
-from flowrec.physics import sample
-from flowrec.stages import MOVIE, FieldCommand, FieldLog, FieldState, field_motion, read_coil_log
+from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outputs
+from flowrec.stages import MOVIE, FieldCommand, FieldLog, FieldState, Floats, field_motion, read_coil_log
 from flowrec.store import Session, files_behind
 
+Stamps = NDArray[np.int64]
 # A log on another clock: any offset, and rates of 30 % to either side.
 ANYWHERE = SearchRange(least_rate=0.7, largest_rate=1.0 / 0.7)
 _ONE_CLOCK = SearchRange(-2.0, 2.0)  # from command to motion
@@ -41,8 +30,6 @@ _LEAST_RAD = math.radians(2.0)  # by which the axes of the heading differ at lea
 # up to which its rows are samples, and the least number of them.
 _SPARSE, _EVEN, _LEAST_SAMPLES = 2.0, 3.0, 10
 _POOR_OFFSET_S = 0.01  # larger errors cost the refined flow about a percent
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,45 +59,38 @@ def calibrate_motion(
     OutputError, SessionError : see `Output.check` and `Session`.
     """
     session = Session(path)
-    output = Output(out, TOML, tuple(files_behind(path)), overwrite) if out is not None else None
-    if output is not None:
-        output.check()
+    outputs = check_outputs(out, tuple(files_behind(path)), overwrite)
     every = list(session.messages("track"))
     tracks = [track for track in every if track.seen]
+    stamps_ns = np.array([track.stamp_ns for track in tracks], np.int64)
+    positions = np.array([track.position_um for track in tracks]).reshape(-1, 2)
+    # The flow that was assumed: that of a refinement has seen the um per revolution of the settings.
+    flow = session.fields.get("assumed")
     imported = session.config.rig == MOVIE
     if coils is not None:
         log = read_coil_log(coils, session.config.movie.columns, session.config.coils)
-        fit, name = fit_tracks(tracks, log, ANYWHERE, flow=_assumed_flow(session)), coils.name
+        fit, name = fit_log(stamps_ns, positions, log, ANYWHERE, flow), coils.name
     elif imported:
-        fit, name = _fit_applied(tracks, list(session.messages("applied")), _assumed_flow(session)), "the session's log"
+        turns, span_s = _applied_turns(session)
+        fit = fit_motion(stamps_ns / NS_PER_S, positions, turns, span_s, _ONE_CLOCK, flow)
+        name = "the session's log"
     else:
         log = commanded_field(list(session.messages("currents")))
-        fit = fit_tracks(tracks, log, _ONE_CLOCK, flow=_assumed_flow(session), exact_log=True)
+        fit = fit_log(stamps_ns, positions, log, _ONE_CLOCK, flow, exact_log=True)
         name = "the session's commands"
     if fit.refusal:
         raise UsageError(f"{path}: {fit.refusal}")
     shared = coils is None and not imported
     sets, advice = _propose_settings(fit, session, shared_clock=shared, own_log=coils is None)
-    motion = MotionCalibration(
-        fit, name, shared, sets, advice, Coverage(len(tracks), len(every), "images", "show the robot")
-    )
-    if output is not None:
-        with output.new_file() as part:
-            part.write_text(fragment(motion, path), encoding="utf-8")
+    covered = Coverage(len(tracks), len(every), "images", "show the robot")
+    motion = MotionCalibration(fit, name, shared, sets, advice, covered)
+    if outputs:
+        write_outputs(outputs, (fragment(motion, path).encode(),))
     return motion
 
 
-def fit_tracks(
-    tracks: list[Track], log: FieldLog, within: SearchRange, flow: FlowField | None = None, exact_log: bool = False
-) -> MotionFit:
-    """The fit of the tracks in which the robot is seen to a log; stamps and log in s. UsageError, see `fit_motion`."""
-    stamps_ns = np.array([track.stamp_ns for track in tracks], np.int64)
-    positions = np.array([track.position_um for track in tracks]).reshape(-1, 2)
-    return fit_log(stamps_ns, positions, log, within, flow, exact_log=exact_log)
-
-
 def fit_log(
-    stamps_ns: NDArray[np.int64],
+    stamps_ns: Stamps,
     positions_um: Floats,
     log: FieldLog,
     within: SearchRange,
@@ -136,19 +116,9 @@ def fit_log(
         return np.asarray(np.mean([log.turns_until(at_ns + each) for each in around_ns], axis=0), np.float64)
 
     begin_s = seconds(begin_ns)
-    span = (begin_s, seconds(int(log.times_ns[-1])))
+    span_s = (begin_s, seconds(int(log.times_ns[-1])))
     times_s = stamps_ns / NS_PER_S
-    carried = _flow_displacement(times_s, positions_um, flow)
-    return fit_motion(
-        times_s,
-        positions_um,
-        turns,
-        span,
-        within,
-        exact_log=exact_log,
-        carried_um=carried,
-        log_error_s=log_error_s,
-    )
+    return fit_motion(times_s, positions_um, turns, span_s, within, flow, exact_log=exact_log, log_error_s=log_error_s)
 
 
 def sampled_s(log: FieldLog, image_s: float) -> float | None:
@@ -163,7 +133,7 @@ def sampled_s(log: FieldLog, image_s: float) -> float | None:
 
 
 def fit_samples(
-    stamps_ns: NDArray[np.int64],
+    stamps_ns: Stamps,
     positions_um: Floats,
     log: FieldLog,
     within: SearchRange,
@@ -186,7 +156,7 @@ def fit_samples(
     return fit
 
 
-def _means(stamps_ns: NDArray[np.int64], positions_um: Floats, window: int) -> tuple[NDArray[np.int64], Floats, Floats]:
+def _means(stamps_ns: Stamps, positions_um: Floats, window: int) -> tuple[Stamps, Floats, Floats]:
     """Mean stamps (m,) and positions (m, 2) of so many frames in turn, and when those are around the mean, in ns."""
     used = len(stamps_ns) // window * window
     stamps, places = stamps_ns[:used].reshape(-1, window), positions_um[:used].reshape(-1, window, 2)
@@ -197,69 +167,35 @@ def _means(stamps_ns: NDArray[np.int64], positions_um: Floats, window: int) -> t
     return means_ns, np.asarray(places[whole].mean(axis=1)), around_ns.astype(np.float64)
 
 
-def _fit_applied(tracks: list[Track], applied: list[Applied], flow: FlowField | None) -> MotionFit:
-    """The fit to what an imported session holds: the turns from frame to frame."""
+def _applied_turns(session: Session) -> tuple[Turns, tuple[float, float]]:
+    """The turns from image to image that an imported session holds, and their span in s."""
+    applied = list(session.messages("applied"))
     stamps_s = np.array([each.stamp_ns for each in applied]) / NS_PER_S
     total = np.cumsum([each.turns for each in applied], axis=0)
-    seen_s = np.array([track.stamp_ns for track in tracks]) / NS_PER_S
-    positions = np.array([track.position_um for track in tracks]).reshape(-1, 2)
 
     def turns(time_s: Floats) -> Floats:
         return np.column_stack([np.interp(time_s, stamps_s, total[:, axis]) for axis in (0, 1)])
 
-    span = (float(stamps_s[0]), float(stamps_s[-1]))
-    return fit_motion(
-        seen_s,
-        positions,
-        turns,
-        span,
-        _ONE_CLOCK,
-        exact_log=False,
-        carried_um=_flow_displacement(seen_s, positions, flow),
-    )
+    return turns, (float(stamps_s[0]), float(stamps_s[-1]))
 
 
 def commanded_field(currents: list[Currents]) -> FieldLog:
     """The field that the commands of a session ask for, without delay: the plane turns as it is ordered."""
     log, state = FieldLog(), FieldState()
-    changes = [
-        now
-        for before, now in zip([None, *currents[:-1]], currents, strict=True)
-        if before is None or _differ(before, now)
-    ]
-    for command, after in zip(changes, [*changes[1:], currents[-1]], strict=True) if changes else ():
-        c = command
-        motion = field_motion(state, FieldCommand(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz))
-        duration_s = seconds(after.stamp_ns - c.stamp_ns)
-        log.extend(c.stamp_ns, motion.segments(duration_s), c.amplitude_mt)
+    changes = [(command, next(same)) for command, same in groupby(currents, _command)]
+    ends_ns = [*(current.stamp_ns for _, current in changes[1:]), *(current.stamp_ns for current in currents[-1:])]
+    for (command, current), end_ns in zip(changes, ends_ns, strict=True):
+        motion = field_motion(state, command)
+        duration_s = seconds(end_ns - current.stamp_ns)
+        log.extend(current.stamp_ns, motion.segments(duration_s), command.amplitude_mt)
         if duration_s <= 0.0:
-            log.append(c.stamp_ns, c.frequency_hz, c.heading_rad, c.amplitude_mt)
+            log.append(current.stamp_ns, command.frequency_hz, command.heading_rad, command.amplitude_mt)
         state = motion.after(duration_s)
     return log
 
 
-def _differ(one: Currents, other: Currents) -> bool:
-    return (one.frequency_hz, one.heading_rad, one.amplitude_mt, one.limit_hz) != (
-        other.frequency_hz,
-        other.heading_rad,
-        other.amplitude_mt,
-        other.limit_hz,
-    )
-
-
-def _assumed_flow(session: Session) -> FlowField | None:
-    """The flow that was assumed: that of a refinement has seen the um per revolution of the settings."""
-    return session.fields.get("assumed")
-
-
-def _flow_displacement(times_s: Floats, positions_um: Floats, flow: FlowField | None) -> Floats | None:
-    """(n, 2) um that a flow carries the robot until each frame."""
-    if flow is None or not len(times_s):
-        return None
-    speed = np.array([sample(flow, point) for point in positions_um])
-    steps = 0.5 * np.diff(times_s)[:, None] * (speed[1:] + speed[:-1])
-    carried: Floats = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    return carried if carried.any() else None
+def _command(current: Currents) -> FieldCommand:
+    return FieldCommand(current.frequency_hz, current.heading_rad, current.amplitude_mt, current.limit_hz)
 
 
 def heading_settings(fit: MotionFit, offset_deg: float, mirrored: bool) -> dict[str, float | bool]:
@@ -268,12 +204,15 @@ def heading_settings(fit: MotionFit, offset_deg: float, mirrored: bool) -> dict[
     if fit.mirrored:
         changed["movie.heading_mirrored"] = not mirrored
         offset_deg = -offset_deg
-    turned_rad = fit.heading_offset_rad
-    turned = abs(turned_rad) > max(_SIGNIFICANT * fit.heading_offset_std_rad, _LEAST_RAD)
+    turned = _is_turned(fit)
     if turned or fit.mirrored:
-        total = offset_deg + (math.degrees(turned_rad) if turned else 0.0)
+        total = offset_deg + (math.degrees(fit.heading_offset_rad) if turned else 0.0)
         changed["movie.heading_offset_deg"] = round((total + 180.0) % 360.0 - 180.0, 2) + 0.0
     return changed
+
+
+def _is_turned(fit: MotionFit) -> bool:
+    return abs(fit.heading_offset_rad) > max(_SIGNIFICANT * fit.heading_offset_std_rad, _LEAST_RAD)
 
 
 def _propose_settings(
@@ -304,7 +243,7 @@ def _propose_settings(
         sets |= heading_settings(fit, movie.heading_offset_deg, movie.heading_mirrored) if own_log else {}
     if fit.mirrored:
         advice.append("the y axis of the log's headings is opposed to that of the chip (image: y down)")
-    if abs(fit.heading_offset_rad) > max(_SIGNIFICANT * fit.heading_offset_std_rad, _LEAST_RAD):
+    if _is_turned(fit):
         degrees = math.degrees(fit.heading_offset_rad)
         where = "" if not shared_clock else "; see coils.mt_per_a (its axes) and camera.angle_deg"
         advice.append(f"the robot travels {degrees:+.1f} degrees off the heading{where}")
@@ -326,19 +265,9 @@ def remarks(fit: MotionFit) -> list[str]:
 
 def fragment(motion: MotionCalibration, path: Path) -> str:
     """The settings as TOML, with a comment on their source."""
-    lines = [f"# By flowrec {__version__} calibrate motion from {path.name} and {motion.log}.", *_comments(motion.fit)]
-    section = ""
-    for key, value in sorted(motion.sets.items()):
-        name, _, setting = key.partition(".")
-        if name != section:
-            lines.append(f"[{name}]")
-            section = name
-        lines.append(f"{setting} = {str(value).lower() if isinstance(value, bool) else value}")
-    return "\n".join(lines) + "\n"
-
-
-def _comments(fit: MotionFit) -> list[str]:
-    return [f"# {name}: {value}" for name, value in rows_of(fit)]
+    comments = (f"{name}: {value}" for name, value in rows_of(motion.fit))
+    source = f"By flowrec {__version__} calibrate motion from {path.name} and {motion.log}."
+    return as_toml((source, *comments), dict(sorted(motion.sets.items())))
 
 
 def rows_of(fit: MotionFit, offset: tuple[str, str] | None = None, shared_clock: bool = False) -> list[tuple[str, str]]:
@@ -364,18 +293,13 @@ def rows_of(fit: MotionFit, offset: tuple[str, str] | None = None, shared_clock:
     return rows
 
 
-def as_sets(motion: MotionCalibration) -> list[str]:
-    """The settings as values of --set."""
-    return [f"{key}={str(v).lower() if isinstance(v, bool) else v}" for key, v in motion.sets.items()]
-
-
 def figures(motion: MotionCalibration) -> dict[str, Any]:
     """The fit as plain numbers; None where the movie does not determine one."""
     return figures_of(motion.fit) | {
         "log": motion.log,
         "shared_clock": motion.shared_clock,
         "advice": list(motion.advice),
-        "set": as_sets(motion),
+        "set": as_sets(motion.sets),
         "covered": motion.covered.as_json(),
     }
 
@@ -412,4 +336,4 @@ def show(motion: MotionCalibration, path: Path, out: Path | None) -> None:
     say(motion.covered.amount)
     if out is not None:
         say(f"{out} written")
-    say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(motion)))
+    say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(motion.sets)))

@@ -14,9 +14,8 @@ from scipy.stats import t as student
 from flowrec.core import UsageError, refuse_irregular
 from flowrec.stages import WORST_CONDITION, direction_name
 
-CURRENTS = ("i_x_a", "i_y_a", "i_z_a")
-FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
-_COLUMNS = CURRENTS + FIELDS
+Floats = NDArray[np.float64]
+_COLUMNS = ("i_x_a", "i_y_a", "i_z_a", "b_x_mt", "b_y_mt", "b_z_mt")
 _HEADER = ",".join(_COLUMNS)
 _UNIT_NAMES = {"a": "ampere", "mt": "millitesla"}
 _UNKNOWNS = 4  # of each axis: three coils and the bias
@@ -33,8 +32,8 @@ _DIRECTIONS = 400  # in which the uncertainty is evaluated
 class Excitations:
     """Rows of the file. Axes are those of the chip: x and y as in the image, z up from the floor."""
 
-    currents_a: NDArray[np.float64]  # (n, 3)
-    field_mt: NDArray[np.float64]  # (n, 3)
+    currents_a: Floats  # (n, 3)
+    field_mt: Floats  # (n, 3)
     lines: tuple[int, ...]  # (n,) line of each row in the file
     name: str
 
@@ -56,17 +55,23 @@ def read_excitations(path: Path) -> Excitations:
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: can not be read as a CSV file ({error})") from error
     rows = [
-        (number, _cells(line, f"{path}:{number}"))
+        (number, f"{path}:{number}", _cells(line, f"{path}:{number}"))
         for number, line in enumerate(text.splitlines(), 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not rows:
         raise UsageError(f"{path}: is empty; the first line is {_HEADER}, then one row for each excitation")
-    header_line, header = rows[0]
-    columns = _columns(header, f"{path}:{header_line}")
-    values = [_numbers(cells, columns, len(header), f"{path}:{number}") for number, cells in rows[1:]]
+    (_, where_header, header), *rows = rows
+    places = [_place(name, header, where_header) for name in _COLUMNS]
+    values = []
+    for _, where, cells in rows:
+        if len(cells) != len(header):
+            raise UsageError(
+                f"{where}: {len(cells)} values where the header has {len(header)} columns; correct that line"
+            )
+        values.append([_number(name, cells[place], where) for name, place in zip(_COLUMNS, places, strict=True)])
     table = np.array(values, np.float64).reshape(-1, 6)
-    return Excitations(table[:, :3], table[:, 3:], tuple(number for number, _ in rows[1:]), path.name)
+    return Excitations(table[:, :3], table[:, 3:], tuple(number for number, _, _ in rows), path.name)
 
 
 def _cells(line: str, where: str) -> list[str]:
@@ -76,41 +81,32 @@ def _cells(line: str, where: str) -> list[str]:
         raise UsageError(f"{where}: {error}; is it no table?") from error
 
 
-def _columns(header: list[str], where: str) -> list[int]:
-    """Index of each of the six columns."""
-    given = [name.lower() for name in header]
+def _place(name: str, header: list[str], where: str) -> int:
+    """Place of a column in the header."""
+    given = [each.lower() for each in header]
+    if given.count(name) == 1:
+        return given.index(name)
     if len(given) == 1 and ";" in given[0]:
         raise UsageError(f"{where}: columns are separated by ';'; save it with commas, and points in the numbers")
-    for name in _COLUMNS:
-        if given.count(name) == 1:
-            continue
-        if given.count(name) > 1:
-            raise UsageError(f"{where}: two columns are named {name}; leave one")
-        stem, _, unit = name.rpartition("_")
-        other = next((word for word in given if stem in (word.rpartition("_")[0], word)), None)
-        if other is not None:
-            raise UsageError(
-                f"{where}: column {other!r} where {name!r} belongs: give it in {_UNIT_NAMES[unit]}, and say so in its "
-                "name"
-            )
+    if name in given:
+        raise UsageError(f"{where}: two columns are named {name}; leave one")
+    stem, _, unit = name.rpartition("_")
+    other = next((word for word in given if stem in (word.rpartition("_")[0], word)), None)
+    if other is None:
         raise UsageError(f"{where}: no column {name}; the header is {_HEADER}")
-    return [given.index(name) for name in _COLUMNS]
+    raise UsageError(
+        f"{where}: column {other!r} where {name!r} belongs: give it in {_UNIT_NAMES[unit]}, and say so in its name"
+    )
 
 
-def _numbers(cells: list[str], columns: list[int], count: int, where: str) -> list[float]:
-    """The six values of a row."""
-    if len(cells) != count:
-        raise UsageError(f"{where}: {len(cells)} values where the header has {count} columns; correct that line")
-    values = []
-    for column, name in zip(columns, _COLUMNS, strict=True):
-        try:
-            value = float(cells[column])
-        except ValueError as error:
-            raise UsageError(f"{where}: {name} = {cells[column]!r} is no number; correct that line") from error
-        if not math.isfinite(value):
-            raise UsageError(f"{where}: {name} = {cells[column]}: give a finite number or leave the row out")
-        values.append(value)
-    return values
+def _number(name: str, cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError as error:
+        raise UsageError(f"{where}: {name} = {cell!r} is no number; correct that line") from error
+    if not math.isfinite(value):
+        raise UsageError(f"{where}: {name} = {cell}: give a finite number or leave the row out")
+    return value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,17 +114,23 @@ class CoilFit:
     """B = A i + b with uncertainties; arrays by axis of the field (rows) and coil (columns), both x, y, z."""
 
     excitations: Excitations
-    mt_per_a: NDArray[np.float64]  # (3, 3) A
-    mt_per_a_std: NDArray[np.float64]  # (3, 3) standard errors
-    bias_mt: NDArray[np.float64]  # (3,)
-    bias_std_mt: NDArray[np.float64]  # (3,)
-    residual_mt: NDArray[np.float64]  # (n, 3) measured minus fitted
-    noise_mt: NDArray[np.float64]  # (3,) of one reading: sqrt(sum of squares / degrees of freedom)
+    mt_per_a: Floats  # (3, 3) A
+    mt_per_a_std: Floats  # (3, 3) standard errors
+    bias_mt: Floats  # (3,)
+    bias_std_mt: Floats  # (3,)
+    residual_mt: Floats  # (n, 3) measured minus fitted
+    noise_mt: Floats  # (3,) of one reading: sqrt(sum of squares / degrees of freedom)
     freedom: int  # degrees of freedom: rows minus unknowns
-    left_out_mt: NDArray[np.float64]  # (n, 3) measured minus predicted by the other rows; NaN where they can not
-    score: NDArray[np.float64]  # (n, 3) `left_out_mt` in standard deviations (externally studentised); NaN likewise
+    left_out_mt: Floats  # (n, 3) measured minus predicted by the other rows; NaN where they can not
+    score: Floats  # (n, 3) `left_out_mt` in standard deviations (externally studentised); NaN likewise
     critical_score: float  # critical score for all rows and axes together; inf without degrees of freedom
     uncertainty_mt: float  # standard error of a nominal field in the worst direction, from the fit alone
+
+    @property
+    def worst(self) -> list[int]:
+        """Row of the largest residual of each axis."""
+        rows: list[int] = np.abs(self.residual_mt).argmax(axis=0).tolist()
+        return rows
 
     @property
     def suspects(self) -> list[int]:
@@ -263,9 +265,7 @@ def _refuse_too_little(excitations: Excitations) -> None:
     raise UsageError(f"{where}: {why}; add rows with the currents {' and '.join(rows)} A")
 
 
-def _uncertainty_mt(
-    A: NDArray[np.float64], bias: NDArray[np.float64], variance: NDArray[np.float64], unscaled: NDArray[np.float64]
-) -> float:
+def _uncertainty_mt(A: Floats, bias: Floats, variance: Floats, unscaled: Floats) -> float:
     """Standard error of a nominal field, from the fit alone: the largest over directions on a spiral on the sphere."""
     k = np.arange(_DIRECTIONS) + 0.5
     z, azimuth = 1.0 - k / (0.5 * _DIRECTIONS), np.pi * (1.0 + 5.0**0.5) * k

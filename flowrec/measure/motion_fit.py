@@ -22,17 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import exp1
 
-from flowrec.core import UsageError
-from flowrec.measure.motion_regression import (
-    MotionRegression,
-    Place,
-    TrackData,
-    covariance,
-    heading_and_size,
-    regress,
-    remainder,
-)
-from flowrec.measure.motion_search import SearchRange, Turns, search
+from flowrec.core import FlowField, UsageError
+from flowrec.measure.motion_regression import MotionRegression, Place, TrackRegression, Turns, heading_and_size
+from flowrec.measure.motion_search import SearchRange, search
+from flowrec.physics import sample
 from flowrec.stages import (
     FREEDOM,
     RESTART,
@@ -40,7 +33,6 @@ from flowrec.stages import (
     USED,
     Flags,
     Floats,
-    NoiseModel,
     fit_noise,
     whiten,
     without_jumps,
@@ -95,8 +87,6 @@ class MotionFit:
     refusal: str  # why the fit must not be used, for people; '' if it may be
     frames: int  # that were used
     left_out: int  # frames with a position that the robot can not have reached
-    flow_scale: float  # of the known flow; 0 without one
-    noise: NoiseModel
 
     @property
     def accepted(self) -> bool:
@@ -110,9 +100,9 @@ def fit_motion(
     turns: Turns,
     log_span_s: tuple[float, float],
     within: SearchRange,
+    flow: FlowField | None = None,
     *,
     exact_log: bool = False,
-    carried_um: ArrayLike | None = None,
     log_error_s: float = 0.0,
 ) -> MotionFit:
     """Place a movie in a log.
@@ -122,55 +112,54 @@ def fit_motion(
     stamps_s, positions_um : (n,) and (n, 2) of the frames in which the robot was seen, on the movie's clock.
     turns, log_span_s : the log, and its first and last time on its own clock.
     within : where to search.
+    flow : known one, which carries the robot; its scale is fitted.
     exact_log : it tells what the field did; else what was commanded, which takes effect within a turn of the field.
-    carried_um : (n, 2) displacement by the known flow until each frame; its scale is fitted.
     log_error_s : standard error of the times at which the log says that the field changed.
 
     Raises
     ------
     UsageError : too few frames, a robot that does not move, or a log without turns.
     """
-    data = _check_data(stamps_s, positions_um, turns, carried_um)
-    time_s, positions = data.time_s, data.positions_um
+    time_s, positions = _check_track(stamps_s, positions_um)
+    carried = _flow_displacement(time_s, positions, flow)
+    positions = positions - positions.mean(0)
     everything = _stretches(time_s, positions)
     noise = fit_noise(time_s, positions, everything)
     part = _liveliest(whiten(time_s, positions, everything, noise))
-    seen = TrackData(time_s[part], positions[part], turns)
-    found = search(seen.time_s, seen.positions_um, everything[part], noise, turns, log_span_s, within)
-    if not found.candidates:
+    free = (within.last_offset_s > within.first_offset_s, within.largest_rate > within.least_rate)
+    seen = TrackRegression(time_s[part], positions[part], everything[part], noise, turns, free)
+    candidates, p_value = search(seen, log_span_s, within)
+    if not candidates:
         raise UsageError(
             "no turns of the field with the amplitude on at the times of the movie, so nothing can be compared"
         )
-    may_drift = within.largest_rate > within.least_rate
-    free = (within.last_offset_s > within.first_offset_s, may_drift)
+    track = TrackRegression(time_s, positions, everything, noise, turns, free, carried)
     places = [
         Place(each.offset_s + (each.rate - 1.0) * seen.middle_s, each.rate, each.mirrored)
-        for each in found.candidates[:_REFINED]
+        for each in candidates[:_REFINED]
     ]
     if len(seen.time_s) < len(time_s):  # where a part lies tells the rate well enough for the whole
-        found_there = [regress(seen, each, everything[part], noise, free).place for each in places]
-        lever_s = data.middle_s - seen.middle_s
+        found_there = [seen.fit(each).place for each in places]
+        lever_s = track.middle_s - seen.middle_s
         places = [each._replace(offset_s=each.offset_s + (each.rate - 1.0) * lever_s) for each in found_there]
-    best = min((regress(data, each, everything, noise, free) for each in places), key=lambda fit: fit.cost)
-    flags = everything
+    best = min((track.fit(each) for each in places), key=lambda fit: fit.cost)
     for _ in range(_ROUNDS):
-        rest = remainder(data, best)
-        noise = fit_noise(time_s, rest, flags, noise)
-        flags = without_jumps(time_s, rest, everything, noise, _GATE)
-        best = regress(data, best.place, flags, noise, free)
-    others = [regress(data, each, flags, noise, free) for each in places]
-    nearer = min(
-        (fit for fit in others if not _apart(fit.place, best.place, data)), key=lambda fit: fit.cost, default=best
-    )
-    best = min(best, nearer, key=lambda fit: fit.cost)
-    second = min((fit for fit in others if _apart(fit.place, best.place, data)), key=lambda fit: fit.cost, default=None)
+        rest = track.remainder(best)
+        noise = fit_noise(time_s, rest, track.flags, track.noise)
+        track = replace(track, noise=noise, flags=without_jumps(time_s, rest, everything, noise, _GATE))
+        best = track.fit(best.place)
+    others = [track.fit(each) for each in places]
+    nearer = (fit for fit in others if not _apart(fit.place, best.place, track))
+    best = min((best, *nearer), key=lambda fit: fit.cost)
+    apart = (fit for fit in others if _apart(fit.place, best.place, track))
+    second = min(apart, key=lambda fit: fit.cost, default=None)
     late_s = math.hypot(_OFFSET_S, log_error_s)
     if not exact_log:  # a log of commands is late by a part of a revolution that differs from change to change
-        late_s = math.hypot(late_s, _COMMAND_REVOLUTIONS / max(_mean_hz(data, best), 1e-3))
-    return _result(data, best, second, found.p_value, (everything, flags), noise, free, late_s)
+        late_s = math.hypot(late_s, _COMMAND_REVOLUTIONS / max(_mean_hz(track, best), 1e-3))
+    return _result(track, best, second, p_value, everything, late_s)
 
 
-def _check_data(stamps_s: ArrayLike, positions_um: ArrayLike, turns: Turns, carried_um: ArrayLike | None) -> TrackData:
+def _check_track(stamps_s: ArrayLike, positions_um: ArrayLike) -> tuple[Floats, Floats]:
     time_s, positions = np.array(stamps_s, np.float64), np.array(positions_um, np.float64)
     if positions.shape != (len(time_s), 2) or not np.isfinite(positions).all() or not (np.diff(time_s) > 0.0).all():
         raise UsageError("stamps must increase, and every one needs a position (x, y) that is a number")
@@ -178,47 +167,52 @@ def _check_data(stamps_s: ArrayLike, positions_um: ArrayLike, turns: Turns, carr
         raise UsageError(f"{len(time_s)} frames with the robot; at least {LEAST_FRAMES} are needed")
     if not np.ptp(positions, axis=0).any():
         raise UsageError("the robot does not move")
-    carried = None if carried_um is None else np.array(carried_um, np.float64)
-    return TrackData(time_s, positions - positions.mean(0), turns, carried)
+    return time_s, positions
 
 
-def _apart(one: Place, other: Place, data: TrackData) -> bool:
+def _flow_displacement(time_s: Floats, positions_um: Floats, flow: FlowField | None) -> Floats | None:
+    """(n, 2) um that a flow carries the robot until each frame."""
+    if flow is None:
+        return None
+    speed = np.array([sample(flow, point) for point in positions_um])
+    steps = 0.5 * np.diff(time_s)[:, None] * (speed[1:] + speed[:-1])
+    carried = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return carried if carried.any() else None
+
+
+def _apart(one: Place, other: Place, track: TrackRegression) -> bool:
     """True if two places lie at different times of the log."""
-    span_s = float(data.time_s[-1] - data.time_s[0])
-    return abs(one.offset_s - other.offset_s) > 0.1 or abs(one.rate - other.rate) * span_s > 0.2
+    return abs(one.offset_s - other.offset_s) > 0.1 or abs(one.rate - other.rate) * track.duration_s > 0.2
 
 
 def _result(
-    data: TrackData,
+    track: TrackRegression,
     best: MotionRegression,
     second: MotionRegression | None,
     p_value: float,
-    flagged: tuple[Flags, Flags],
-    noise: NoiseModel,
-    free: tuple[bool, bool],
+    everything: Flags,
     late_s: float,
 ) -> MotionFit:
-    everything, flags = flagged
     # A position from which the track comes back at once is an error of the tracker: a command acts on the velocity.
-    everything = np.where(flags == SKIPPED, flags, everything)
-    free_fit, errors = best, covariance(data, best, free)
+    whole = replace(track, flags=np.where(track.flags == SKIPPED, track.flags, everything))
+    ambiguous = second is not None and second.cost - best.cost < _AMBIGUOUS
+    errors = track.covariance(best)
     rate, rate_std = best.place.rate, 0.0
-    span_s = float(data.time_s[-1] - data.time_s[0])
-    if free[1]:
-        rate_std = math.hypot(math.sqrt(errors[1, 1]), 2.0 * late_s / span_s)
-        fixed = regress(data, best.place._replace(rate=1.0), flags, noise, (free[0], False))
+    if track.free[1]:
+        rate_std = math.hypot(math.sqrt(errors[1, 1]), 2.0 * late_s / track.duration_s)
+        at_rate_1 = replace(track, free=(track.free[0], False))
+        fixed = at_rate_1.fit(best.place._replace(rate=1.0))
         if not abs(rate - 1.0) > _SIGNIFICANT * rate_std or fixed.cost - best.cost < _RATE_BY_CHANCE:
-            best, free = fixed, (free[0], False)
-            errors = covariance(data, best, free)
-    place, middle_s = best.place, data.middle_s
-    # Offset at the start of the movie's clock: that of its middle less (rate - 1) * middle.
-    offset_s = place.offset_s - (place.rate - 1.0) * middle_s
-    lever = np.array([1.0, -middle_s]) if free[1] else np.array([1.0, 0.0])
+            track, best, errors = at_rate_1, fixed, at_rate_1.covariance(fixed)
+    place, middle_s = best.place, track.middle_s
+    lever = np.array([1.0, -middle_s if track.free[1] else 0.0])
     variance = float(lever @ errors[:2, :2] @ lever) if np.isfinite(errors).all() else math.inf
     k, heading, k_std, heading_std = heading_and_size(best.gain, errors[2:, 2:])
-    unsure = _GAIN if data.carried_um is not None else _GAIN_WITHOUT_FLOW
+    unsure = _GAIN if track.carried_um is not None else _GAIN_WITHOUT_FLOW
+    left_out = int((track.flags == SKIPPED).sum())
     fit = MotionFit(
-        offset_s=offset_s,
+        # At the start of the movie's clock: the offset of its middle less (rate - 1) * middle.
+        offset_s=place.offset_s - (place.rate - 1.0) * middle_s,
         offset_std_s=math.hypot(math.sqrt(max(variance, 0.0)), late_s),
         rate=place.rate,
         rate_estimate=rate,
@@ -228,28 +222,24 @@ def _result(
         heading_offset_rad=heading,
         heading_offset_std_rad=math.hypot(heading_std, _HEADING_RAD),
         mirrored=place.mirrored,
-        explained=_explained_fraction(data, best, everything, noise),
-        second_explained=0.0 if second is None else _explained_fraction(data, second, everything, noise),
+        explained=_explained_fraction(whole, best),
+        second_explained=0.0 if second is None else _explained_fraction(whole, second),
         p_value=p_value,
         refusal="",
-        frames=int((flags != SKIPPED).sum()),
-        left_out=int((flags == SKIPPED).sum()),
-        flow_scale=best.flow_scale,
-        noise=noise,
+        frames=len(track.flags) - left_out,
+        left_out=left_out,
     )
-    ambiguous = second is not None and second.cost - free_fit.cost < _AMBIGUOUS
     return replace(fit, refusal=_refusal(fit, ambiguous=ambiguous))
 
 
-def _explained_fraction(data: TrackData, fit: MotionRegression, everything: Flags, noise: NoiseModel) -> float:
+def _explained_fraction(track: TrackRegression, fit: MotionRegression) -> float:
     """Fraction of the logarithm of the likelihood above that of noise alone which the log accounts for; at most 1.
 
     As innovations have Student's t distribution, log(1 + square / freedom) of each counts: five positions of something
     else do not outweigh a hundred changes of the command. No stretch is left out because it does not fit, and the noise
     is that of the quiet half of the frames: large innovations, which the log of another run leaves, are not noise.
     """
-    white = whiten(data.time_s, data.positions_um, everything, noise)
-    left = whiten(data.time_s, remainder(data, fit), everything, noise)
+    white, left = track.whiten(track.positions_um), track.whiten(track.remainder(fit))
     used = np.any(white != 0.0, axis=1)
     moved, rest = (white[used] ** 2).sum(1), (left[used] ** 2).sum(1)
     if not used.any():
@@ -333,11 +323,10 @@ def _spikes(time_s: Floats, positions_um: Floats) -> NDArray[np.intp]:
     return np.flatnonzero((away > _SPIKE * np.median(away)) & (away > _KINK * bend) & (away > moved)) + 2
 
 
-def _mean_hz(data: TrackData, fit: MotionRegression) -> float:
+def _mean_hz(track: TrackRegression, fit: MotionRegression) -> float:
     """Root mean square of the field's frequency while it turns, Hz."""
-    place = fit.place
-    turns = data.turns(data.middle_s + place.offset_s + place.rate * (data.time_s - data.middle_s))
-    speed = np.hypot(*np.diff(turns, axis=0).T) / (place.rate * np.diff(data.time_s))
+    turns = track.turns(track.log_times_s(fit.place))
+    speed = np.hypot(*np.diff(turns, axis=0).T) / (fit.place.rate * np.diff(track.time_s))
     turning = speed[speed > 0.0]
     return float(np.sqrt((turning**2).mean())) if turning.size else 0.0
 

@@ -11,17 +11,13 @@ correlation is by chance.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
-from flowrec.stages import Flags, Floats, NoiseModel, whiten
-
-# (n,) times of the log in s to (n, 2) revolutions along x and y since its first row.
-Turns = Callable[[Floats], Floats]
+from flowrec.measure.motion_regression import TrackRegression, Turns
+from flowrec.stages import Floats, whiten
 
 _LEAST_OVERLAP = 0.5  # of the shorter of movie and log
 _RATE_STEP = 0.6  # frames by which the ends of the movie move at most between two rates of the search
@@ -43,15 +39,6 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class SearchResult:
-    """Candidates, best first; none where the log has no turns."""
-
-    candidates: tuple[Candidate, ...]
-    second_r2: float  # best that is neither near the first one in time nor in rate
-    p_value: float  # probability that a log of another run reaches the first one's r2 somewhere in the search
-
-
-@dataclass(frozen=True, slots=True)
 class SearchRange:
     """Bounds of the search: offsets at the middle of the movie, in s of the log less s of the movie, and rates."""
 
@@ -62,22 +49,19 @@ class SearchRange:
 
 
 def search(
-    time_s: Floats,
-    positions_um: Floats,
-    flags: Flags,
-    noise: NoiseModel,
-    turns: Turns,
-    log_span_s: tuple[float, float],
-    within: SearchRange,
-) -> SearchResult:
-    """Candidates for the place of a movie in a log.
+    track: TrackRegression, log_span_s: tuple[float, float], within: SearchRange
+) -> tuple[list[Candidate], float]:
+    """Candidates for the place of a movie in a log, best first; none where the log has no turns.
 
     Parameters
     ----------
-    time_s, positions_um, flags : (n,), (n, 2) and (n,), see whitening.py.
-    turns, log_span_s : the log, and its first and last time.
+    log_span_s : first and last time of the log.
+
+    Returns
+    -------
+    The candidates, and the probability that a log of another run reaches the first one's r2 somewhere in the search.
     """
-    motion = _Motion.of(time_s, whiten(time_s, positions_um, flags, noise), flags)
+    motion, turns = _Motion(track), track.turns
     rates = _rates(motion, within)
     chances: list[float] = []
     found: list[Candidate] = []
@@ -85,118 +69,87 @@ def search(
     null_rates = set(np.linspace(0, len(rates) - 1, min(_NULL_RATES, len(rates))).astype(int).tolist())
     begin, end = log_span_s
     for index, rate in enumerate(rates):
-        surface = _Surface.of(motion, noise, turns, log_span_s, rate)
-        found += surface.candidates(within)
+        offsets_s, r2 = _peaks(motion, turns, log_span_s, rate)
+        slack_s = 0.5 * motion.step_s * rate
+        inside = (offsets_s >= within.first_offset_s - slack_s) & (offsets_s <= within.last_offset_s + slack_s)
+        r2 = np.where(inside, r2, 0.0)
+        for mirror, lag in zip(*np.unravel_index(np.argsort(-r2, axis=None)[:_KEPT], r2.shape), strict=True):
+            if r2[mirror, lag] > 0.0:
+                offset_s = float(offsets_s[lag]) - (rate - 1.0) * motion.middle_s
+                found.append(Candidate(offset_s, rate, bool(mirror), float(r2[mirror, lag])))
         if index in null_rates:
-            peaks_per_rate.append(surface.count(within))
-            backwards = _Surface.of(motion, noise, lambda at: turns(begin + end - at), log_span_s, rate)
-            chances += backwards.peaks().tolist()
+            peaks_per_rate.append(int((r2 > 0.0).sum()))
+            _, by_chance = _peaks(motion, lambda at: turns(begin + end - at), log_span_s, rate)
+            chances += by_chance[by_chance > 0.0].tolist()
+    if not found:
+        return [], 1.0
     found.sort(key=lambda each: -each.r2)
-    if not found or found[0].r2 <= 0.0:
-        return SearchResult((), 0.0, 1.0)
-    best = found[0]
-    apart = [each.r2 for each in found if _apart(each, best, motion)]
-    searched = len(rates) * float(np.mean(peaks_per_rate))
     kept: list[Candidate] = []
     for each in found:
         if all(_apart(each, other, motion) or each.mirrored != other.mirrored for other in kept):
             kept.append(each)
         if len(kept) == _KEPT:
             break
-    return SearchResult(tuple(kept), max(apart, default=0.0), _p_value(best.r2, np.array(chances), searched))
+    return kept, _p_value(found[0].r2, np.array(chances), len(rates) * float(np.mean(peaks_per_rate)))
 
 
-@dataclass(frozen=True, slots=True)
 class _Motion:
-    """Whitened motion on the grid of the frames."""
+    """Whitened motion on the grid of the frames.
 
-    middle_s: float
-    first_s: float
-    step_s: float
-    motion: NDArray[np.complex128]  # (n,)
-    present: Floats  # (n,) 1 where there is a frame
+    Attributes
+    ----------
+    motion : (n,).
+    present : (n,) 1 where there is a frame.
+    """
 
-    @classmethod
-    def of(cls, time_s: Floats, white: Floats, flags: Flags) -> _Motion:
-        step_s = float(np.median(np.diff(time_s)))
-        at = np.rint((time_s - time_s[0]) / step_s).astype(int)
-        motion, present = np.zeros(at[-1] + 1, np.complex128), np.zeros(at[-1] + 1)
+    def __init__(self, track: TrackRegression) -> None:
+        time_s, white = track.time_s, track.whiten(track.positions_um)
+        self.noise, self.middle_s, self.first_s = track.noise, track.middle_s, float(time_s[0])
+        self.step_s = float(np.median(np.diff(time_s)))
+        at = np.rint((time_s - time_s[0]) / self.step_s).astype(int)
+        self.motion, self.present = np.zeros(at[-1] + 1, np.complex128), np.zeros(at[-1] + 1)
         used = np.any(white != 0.0, axis=1)
         given = white[used, 0] + 1j * white[used, 1]
         # Clipped, so that a few wrong positions do not outweigh the motion.
         size = np.abs(given)
         limit = _CLIP * float(np.quantile(size, 0.9)) if size.size else 0.0
-        np.add.at(motion, at[used], given * np.minimum(1.0, limit / np.maximum(size, 1e-300)))
-        present[at[used]] = 1.0
-        return cls(0.5 * float(time_s[0] + time_s[-1]), float(time_s[0]), step_s, motion, present)
-
-    @property
-    def duration_s(self) -> float:
-        return (len(self.motion) - 1) * self.step_s
+        np.add.at(self.motion, at[used], given * np.minimum(1.0, limit / np.maximum(size, 1e-300)))
+        self.present[at[used]] = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Surface:
-    """Correlations at all offsets, for one rate."""
+def _peaks(motion: _Motion, turns: Turns, span_s: tuple[float, float], rate: float) -> tuple[Floats, Floats]:
+    """Offsets (k,) at the middle of the movie for one rate, and the local maxima (2, k) of r2 there; 0 elsewhere.
 
-    rate: float
-    offsets_s: Floats  # (k,) at the middle of the movie
-    r2: Floats  # (2, k): axes as they are, and mirrored
-    motion: _Motion
-
-    @classmethod
-    def of(cls, motion: _Motion, noise: NoiseModel, turns: Turns, span_s: tuple[float, float], rate: float) -> _Surface:
-        n, step = len(motion.motion), motion.step_s * rate
-        begin, end = span_s
-        overlap = max(int(_LEAST_OVERLAP * min(n, (end - begin) / step)), 3)
-        # The grid starts so much before the log that the movie overlaps it by `overlap` frames at the first offset.
-        first = begin - (n - overlap) * step
-        lags = max(int((end - begin) / step) + n - 2 * overlap, 1)
-        at = first + step * np.arange(lags + n - 1)
-        # The log's rows last on after its end and the field is off before it: motion in neither is of the log.
-        given = np.where(at <= end, 1.0, 0.0)
-        steady = np.zeros(len(at), np.int8)
-        white = whiten(motion.step_s * np.arange(len(at), dtype=np.float64), turns(np.minimum(at, end)), steady, noise)
-        rolled = (white[:, 0] + 1j * white[:, 1]) * given
-        size = fft.next_fast_len(len(at) + n)
-        of_motion, of_rolled = fft.fft(motion.motion, size), fft.fft(rolled, size)
-        straight = fft.ifft(np.conj(of_motion) * of_rolled)[:lags]
-        mirrored = fft.ifft(np.conj(fft.fft(np.conj(motion.motion), size)) * of_rolled)[:lags]
-        energy = fft.irfft(np.conj(fft.rfft(motion.present, size)) * fft.rfft(np.abs(rolled) ** 2, size), size)[:lags]
-        moved = float((np.abs(motion.motion) ** 2).sum())
-        floor = 1e-9 * max(float(energy.max()), 1e-300)
-        r2 = np.abs(np.stack([straight, mirrored])) ** 2 / (np.maximum(energy, floor) * max(moved, 1e-300))
-        r2[:, energy <= floor] = 0.0
-        shifts = first + step * np.arange(lags) - rate * motion.first_s  # offset at movie time 0
-        offsets_s: Floats = np.asarray(shifts + (rate - 1.0) * motion.middle_s, np.float64)
-        return cls(rate, offsets_s, np.asarray(np.minimum(r2, 1.0), np.float64), motion)
-
-    def _inside(self, within: SearchRange) -> NDArray[np.bool_]:
-        slack = 0.5 * self.motion.step_s * self.rate
-        return (self.offsets_s >= within.first_offset_s - slack) & (self.offsets_s <= within.last_offset_s + slack)
-
-    def _is_peak(self) -> NDArray[np.bool_]:
-        padded = np.pad(self.r2, ((0, 0), (1, 1)))
-        return (self.r2 > 0.0) & (self.r2 >= padded[:, :-2]) & (self.r2 >= padded[:, 2:])
-
-    def peaks(self) -> Floats:
-        """Local maxima over the offsets."""
-        return self.r2[self._is_peak()]
-
-    def count(self, within: SearchRange) -> int:
-        """Number of local maxima in the searched range."""
-        return int((self._is_peak() & self._inside(within)).sum())
-
-    def candidates(self, within: SearchRange) -> list[Candidate]:
-        inside = self._is_peak() & self._inside(within)
-        r2 = np.where(inside, self.r2, 0.0)
-        best = np.argsort(-r2, axis=None)[:_KEPT]
-        result = []
-        for mirror, lag in zip(*np.unravel_index(best, r2.shape), strict=True):
-            if r2[mirror, lag] > 0.0:
-                offset = float(self.offsets_s[lag]) - (self.rate - 1.0) * self.motion.middle_s
-                result.append(Candidate(offset, self.rate, bool(mirror), float(r2[mirror, lag])))
-        return result
+    The first row is of the log's axes as they are, the second one of mirrored ones.
+    """
+    n, step = len(motion.motion), motion.step_s * rate
+    begin, end = span_s
+    overlap = max(int(_LEAST_OVERLAP * min(n, (end - begin) / step)), 3)
+    # The grid starts so much before the log that the movie overlaps it by `overlap` frames at the first offset.
+    first = begin - (n - overlap) * step
+    lags = max(int((end - begin) / step) + n - 2 * overlap, 1)
+    at = first + step * np.arange(lags + n - 1)
+    steady = np.zeros(len(at), np.int8)
+    white = whiten(
+        motion.step_s * np.arange(len(at), dtype=np.float64), turns(np.minimum(at, end)), steady, motion.noise
+    )
+    # The log's rows last on after its end and the field is off before it: motion in neither is of the log.
+    rolled = (white[:, 0] + 1j * white[:, 1]) * np.where(at <= end, 1.0, 0.0)
+    size = fft.next_fast_len(len(at) + n)
+    of_rolled = fft.fft(rolled, size)
+    products = [
+        fft.ifft(np.conj(fft.fft(each, size)) * of_rolled)[:lags] for each in (motion.motion, np.conj(motion.motion))
+    ]
+    energy = fft.irfft(np.conj(fft.rfft(motion.present, size)) * fft.rfft(np.abs(rolled) ** 2, size), size)[:lags]
+    moved = float((np.abs(motion.motion) ** 2).sum())
+    floor = 1e-9 * max(float(energy.max()), 1e-300)
+    r2 = np.abs(np.stack(products)) ** 2 / (np.maximum(energy, floor) * max(moved, 1e-300))
+    r2[:, energy <= floor] = 0.0
+    r2 = np.minimum(r2, 1.0)
+    beside = np.pad(r2, ((0, 0), (1, 1)))
+    shifts_s = first + step * np.arange(lags) - rate * motion.first_s  # offset at movie time 0
+    peak = (r2 >= beside[:, :-2]) & (r2 >= beside[:, 2:])
+    return np.asarray(shifts_s + (rate - 1.0) * motion.middle_s, np.float64), np.where(peak, r2, 0.0)
 
 
 def _rates(motion: _Motion, within: SearchRange) -> list[float]:
@@ -215,7 +168,8 @@ def _apart(one: Candidate, other: Candidate, motion: _Motion) -> bool:
     """True if two candidates place the middle of the movie at different times of the log, or differ much in rate."""
     middle = motion.middle_s
     gap_s = abs(one.offset_s + one.rate * middle - other.offset_s - other.rate * middle)
-    return gap_s > 0.25 or abs(one.rate - other.rate) * motion.duration_s > 1.0
+    duration_s = (len(motion.motion) - 1) * motion.step_s
+    return gap_s > 0.25 or abs(one.rate - other.rate) * duration_s > 1.0
 
 
 def _p_value(r2: float, chances: Floats, searched: float) -> float:

@@ -18,11 +18,10 @@ import numpy as np
 import scipy  # its ndimage and special load at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.measure.wall_search import blur_image, gradient
+from flowrec.measure.images import Floats, Levels, Mask, blur_image, draw_curves, fill_curves, gradient, shrink
 
 Walls = Literal["dark", "bright", "step"]
-Points = NDArray[np.float64]
-Floats = NDArray[np.float32]
+Sizes = NDArray[np.int64]
 _PAD_PX = 24  # by which a channel goes on straight beyond the picture
 _STEP_PX = 0.5  # between two samples of a profile
 _LEAST_REACH_PX, _MOST_REACH_PX = 3.0, 14.0
@@ -40,7 +39,6 @@ _PARTICLE = 0.5  # area of what is a particle in the channel and no island, rela
 # up to _BEYOND_PX outside.
 _EDGE_PX, _TANGENT_PX, _BEYOND_PX = 1.0, 8, 6.0
 _FINER = 4  # pixels that are drawn for one of the mask
-_SHIFT = 4  # bits after the binary point in cv2.fillPoly
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +60,7 @@ class Outline:
     between_px : distance between the wall and a line of the other brightness beside it, if nearly as strong; else 0.
     """
 
-    curves: tuple[Points, ...]
+    curves: tuple[Floats, ...]
     size_px: tuple[int, int]
     walls: Walls
     width_px: float
@@ -74,17 +72,15 @@ class Outline:
     line_px: float
     between_px: float
 
-    def mask(self, finer: float = 1.0) -> NDArray[np.bool_]:
+    def mask(self, finer: float = 1.0) -> Mask:
         """The channel (h, w), True in fluid, at `finer` times the resolution of the picture, over its centre."""
         (width, height), scale = self.size_px, finer * _FINER
         shape = round(height * finer), round(width * finer)
         # A point in the middle of the picture is in the middle of the mask.
         off = 0.5 * (np.array(shape[::-1]) * _FINER - 1) - 0.5 * (np.array(self.size_px) - 1) * scale
         canvas = np.zeros((shape[0] * _FINER, shape[1] * _FINER), np.uint8)
-        drawn = [np.rint((curve * scale + off) * 2**_SHIFT).astype(np.int32) for curve in self.curves]
-        cv2.fillPoly(canvas, drawn, 255, cv2.LINE_8, _SHIFT)
-        share = cv2.resize(canvas, shape[::-1], interpolation=cv2.INTER_AREA)
-        return np.asarray(share >= 128)
+        fill_curves(canvas, (curve * scale + off for curve in self.curves))
+        return shrink(canvas, shape[::-1]) >= 128
 
     def move_walls(self, outwards_px: float) -> Outline:
         """The outline with all walls moved away from the fluid; towards it if negative."""
@@ -92,8 +88,23 @@ class Outline:
         curves = (curve - outwards_px * _inward(curve, level) for curve in self.curves)
         return replace(self, curves=tuple(curves), width_px=self.width_px + 2.0 * outwards_px)
 
+    def enlarge(self, size_px: tuple[int, int]) -> Outline:
+        """The outline in a picture of another size (width, height)."""
+        scale = np.array(size_px) / self.size_px
+        bigger = float(np.sqrt(scale[0] * scale[1]))
+        return replace(
+            self,
+            curves=tuple((curve + 0.5) * scale - 0.5 for curve in self.curves),
+            size_px=size_px,
+            width_px=self.width_px * bigger,
+            gap_px=self.gap_px * bigger,
+            line_px=self.line_px * bigger,
+            rough_px=self.rough_px * bigger,
+            between_px=self.between_px * bigger,
+        )
 
-def outline_of(image: Floats, mask: NDArray[np.bool_], walls: Walls) -> Outline | None:
+
+def outline_of(image: Levels, mask: Mask, walls: Walls) -> Outline | None:
     """The outline near that of a mask (h, w), fitted to a picture (h, w); None if the mask has none."""
     height, width = image.shape
     wide_px = typical_width_px(mask)
@@ -112,8 +123,7 @@ def outline_of(image: Floats, mask: NDArray[np.bool_], walls: Walls) -> Outline 
         if np.count_nonzero(seen) < 20:
             return None
         search_px = min(most_px, 0.5 * reach_px)
-        profiles = _profiles(smooth, points, normals, reach_px + search_px, sizes)
-        off = _offsets(profiles, seen, reach_px)
+        off = _offsets(_profiles(smooth, points, normals, reach_px + search_px, sizes), seen, reach_px)
         moves = np.split(np.where(seen, off, 0.0), sizes)
         weights = np.split(seen.astype(np.float64), sizes)
         moved = np.concatenate([_along(m * w, 4.0) / np.maximum(_along(w, 4.0), 1e-3)
@@ -124,41 +134,50 @@ def outline_of(image: Floats, mask: NDArray[np.bool_], walls: Walls) -> Outline 
     mean = np.median(profiles[seen], axis=0)
     at_px, clear, line_px, between_px = _wall_in(mean, walls)
     alike = _alike(profiles, mean, seen)
-    support = float(np.mean(alike[seen]))
-    gap_px = float(max(_longest(each) for each in np.split(seen & ~alike, sizes)))
     at_walls = np.split(points + at_px * normals, sizes)
-    islands = [each for each in at_walls if _area(each) > _PARTICLE * wide_px**2]
-    curves = [_straight_on(each, (width, height)) for each in islands]
-    explained = _explained_edges(image, curves, reach_px)
-    rough_px = float(np.sqrt(np.mean(np.square(off[seen]))))
+    curves = [_straight_on(each, (width, height)) for each in at_walls if _area(each) > _PARTICLE * wide_px**2]
     return Outline(
-        tuple(curves), (width, height), walls, wide_px, support, gap_px, explained, rough_px, clear, line_px, between_px
+        curves=tuple(curves),
+        size_px=(width, height),
+        walls=walls,
+        width_px=wide_px,
+        support=float(np.mean(alike[seen])),
+        gap_px=float(max(_longest(each) for each in np.split(seen & ~alike, sizes))),
+        explained=_explained_edges(image, curves, reach_px),
+        rough_px=float(np.sqrt(np.mean(np.square(off[seen])))),
+        clear=clear,
+        line_px=line_px,
+        between_px=between_px,
     )
 
 
-def _straight_on(curve: Points, size_px: tuple[int, int]) -> Points:
+def _straight_on(curve: Floats, size_px: tuple[int, int]) -> Floats:
     """A curve (n, 2) whose walls go straight on where they leave the picture, as they came."""
     outside = np.max(np.maximum(-curve, curve - (np.array(size_px) - 1)), axis=1)
     inner = outside < -_EDGE_PX
     if inner.all() or not inner.any():
         return curve
     start = int(np.argmin(inner))  # not in the middle of a wall
-    curve, outside, inner = (np.roll(each, -start, axis=0) for each in (curve, outside, inner))
-    steps = np.flatnonzero(np.diff(np.concatenate(([False], inner, [False]))))
+    curve, far = np.roll(curve, -start, axis=0), np.roll(outside, -start) > _PAD_PX - 8
     parts, end = [], 0
-    for first, last in zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True):
-        between, wall = slice(end, first), curve[first:last]
-        far = outside[between] > _PAD_PX - 8
-        whole = far.any() and last - first >= _TANGENT_PX
-        parts += [curve[between][far] if far.any() else curve[between]]
-        parts += [_extrapolate(wall[::-1], size_px)[::-1], wall, _extrapolate(wall, size_px)] if whole else [wall]
+    for first, last in [*_runs(np.roll(inner, -start)), (len(curve), len(curve))]:
+        between, wall, leaves = curve[end:first], curve[first:last], bool(far[end:first].any())
+        parts.append(between[far[end:first]] if leaves else between)
+        if leaves and last - first >= _TANGENT_PX:
+            parts += [_extrapolate(wall[::-1], size_px)[::-1], wall, _extrapolate(wall, size_px)]
+        else:
+            parts.append(wall)
         end = last
-    rest = slice(end, len(curve))
-    far = outside[rest] > _PAD_PX - 8
-    return np.concatenate((*parts, curve[rest][far] if far.any() else curve[rest]))
+    return np.concatenate(parts)
 
 
-def _extrapolate(wall: Points, size_px: tuple[int, int]) -> Points:
+def _runs(marked: Mask) -> list[tuple[int, int]]:
+    """The first place of each run of marked points (n,), and the one after its last."""
+    steps = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False]))))
+    return list(zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True))
+
+
+def _extrapolate(wall: Floats, size_px: tuple[int, int]) -> Floats:
     """Points (0 or 1, 2): where a wall (n, 2) that goes straight on at its end is a little beyond the picture."""
     last = wall[-_TANGENT_PX:]
     way = np.polyfit(np.arange(len(last)), last, 1)[0]
@@ -170,85 +189,85 @@ def _extrapolate(wall: Points, size_px: tuple[int, int]) -> Points:
     return (begin + count * way)[None] if 0 < count < 200 else np.zeros((0, 2))
 
 
-def _longest(marked: NDArray[np.bool_]) -> int:
+def _longest(marked: Mask) -> int:
     """Length of the longest run of marked points of a closed curve."""
-    steps = np.diff(np.concatenate(([False], marked, marked, [False])).astype(np.int8))
-    runs = np.flatnonzero(steps == -1) - np.flatnonzero(steps == 1)
-    return min(int(runs.max(initial=0)), len(marked))
+    runs = _runs(np.concatenate((marked, marked)))
+    return min(max((last - first for first, last in runs), default=0), len(marked))
 
 
-def _area(curve: Points) -> float:
+def _area(curve: Floats) -> float:
     x, y = curve.T
     return 0.5 * abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))))
 
 
-def typical_width_px(mask: NDArray[np.bool_]) -> float:
+def _pad(mask: Mask) -> NDArray[np.uint8]:
+    return np.pad(mask, _PAD_PX, mode="edge").astype(np.uint8)
+
+
+def _distance(inside: NDArray[np.uint8]) -> Levels:
+    return np.asarray(cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+
+
+def typical_width_px(mask: Mask) -> float:
     """Width of the channel that is exceeded along three quarters of its length."""
     if not mask.any() or mask.all():
         return float(max(mask.shape))
-    padded = np.pad(mask, _PAD_PX, mode="edge").astype(np.uint8)
-    distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = _distance(_pad(mask))
     crest = (distance >= cv2.dilate(distance, np.ones((3, 3), np.uint8))) & (distance > 0.9)
-    crest = crest[_PAD_PX:-_PAD_PX, _PAD_PX:-_PAD_PX]
-    values = distance[_PAD_PX:-_PAD_PX, _PAD_PX:-_PAD_PX][crest]
+    inner = (slice(_PAD_PX, -_PAD_PX),) * 2
+    values = distance[inner][crest[inner]]
     return 2.0 * float(np.percentile(values, 25)) - 1.0 if len(values) else 1.0
 
 
-def _level(mask: NDArray[np.bool_]) -> Floats:
+def _level(mask: Mask) -> Levels:
     """Smooth signed distance (h, w) in pixels, padded, positive in fluid."""
-    padded = np.pad(mask, _PAD_PX, mode="edge").astype(np.uint8)
-    inside = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    outside = cv2.distanceTransform(1 - padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return blur_image(np.asarray(np.where(padded > 0, inside - 0.5, 0.5 - outside), np.float32), 1.2)
+    padded = _pad(mask)
+    return blur_image(np.where(padded > 0, _distance(padded) - 0.5, 0.5 - _distance(1 - padded)), 1.2)
 
 
-def _contours(mask: NDArray[np.bool_]) -> list[Points]:
-    padded = np.pad(mask, _PAD_PX, mode="edge").astype(np.uint8)
-    contours, _ = cv2.findContours(padded, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+def _contours(mask: Mask) -> list[Floats]:
+    contours, _ = cv2.findContours(_pad(mask), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     return [contour[:, 0].astype(np.float64) - _PAD_PX for contour in contours if len(contour) >= 12]
 
 
-def _smooth(contour: Points, level: Floats) -> Points | None:
+def _smooth(contour: Floats, level: Levels) -> Floats | None:
     """A contour along pixels (n, 2) as points about a pixel apart on the smooth level."""
-    curve = scipy.ndimage.gaussian_filter1d(contour, 1.5, axis=0, mode="wrap")
+    curve = _along(contour, 1.5)
     for _ in range(2):
         slope = np.stack([_at(level, curve + step) - _at(level, curve - step) for step in ((0.5, 0), (0, 0.5))], -1)
         move = _at(level, curve)[:, None] * slope / np.maximum(np.sum(slope * slope, -1, keepdims=True), 0.1)
         curve = curve - np.clip(move, -1.0, 1.0)
-    length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(np.vstack((curve, curve[:1])), axis=0).T))))
+    closed = np.vstack((curve, curve[:1]))
+    length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))))
     if length[-1] < 12.0:
         return None
     at = np.linspace(0.0, length[-1], round(length[-1]), endpoint=False)
-    closed = np.vstack((curve, curve[:1]))
     return np.column_stack([np.interp(at, length, closed[:, k]) for k in (0, 1)])
 
 
-def _inward(curve: Points, level: Floats) -> Points:
+def _inward(curve: Floats, level: Levels) -> Floats:
     """Unit normals (n, 2) of a curve, from solid to fluid."""
-    tangent = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
-    tangent = scipy.ndimage.gaussian_filter1d(tangent, 2.0, axis=0, mode="wrap")
+    tangent = _along(np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0), 2.0)
     across = np.stack((-tangent[:, 1], tangent[:, 0]), -1)
     across /= np.maximum(np.hypot(*across.T), 1e-9)[:, None]
     turn = _at(level, curve + across) < _at(level, curve - across)
     return np.where(turn[:, None], -across, across)
 
 
-def _at(padded: Floats, points: Points) -> NDArray[np.float64]:
+def _at(padded: Levels, points: Floats) -> Floats:
     """Values (...) of a padded image at points (..., 2)."""
     at = np.asarray(points + _PAD_PX, np.float32)
-    shape = at.shape[:-1]
     flat = at.reshape(len(at), -1, 2)
     found = cv2.remap(padded, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, np.float64).reshape(shape)
+    return found.astype(np.float64).reshape(at.shape[:-1])
 
 
-def _along(values: NDArray[np.float64], sigma_px: float) -> NDArray[np.float64]:
+def _along(values: Floats, sigma_px: float) -> Floats:
+    """Values (n, ...) along a closed curve, blurred."""
     return np.asarray(scipy.ndimage.gaussian_filter1d(values, sigma_px, axis=0, mode="wrap"))
 
 
-def _profiles(
-    padded: Floats, points: Points, normals: Points, reach_px: float, sizes: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _profiles(padded: Levels, points: Floats, normals: Floats, reach_px: float, sizes: Sizes) -> Floats:
     """Grey levels (n, samples) across the walls, from solid to fluid, averaged along them."""
     count = round(reach_px / _STEP_PX)
     t = _STEP_PX * np.arange(-count, count + 1)
@@ -256,7 +275,7 @@ def _profiles(
     return np.concatenate([_along(part, _ALONG_PX) for part in np.split(values, sizes)])
 
 
-def _offsets(profiles: NDArray[np.float64], seen: NDArray[np.bool_], reach_px: float) -> NDArray[np.float64]:
+def _offsets(profiles: Floats, seen: Mask, reach_px: float) -> Floats:
     """Shift in px at which each profile (n, samples) agrees best with the median of those that are seen."""
     window = 2 * round(reach_px / _STEP_PX) + 1
     extra = (profiles.shape[1] - window) // 2
@@ -277,30 +296,30 @@ def _offsets(profiles: NDArray[np.float64], seen: NDArray[np.bool_], reach_px: f
     return np.where(score[rows, best] > _LEAST_LIKE, np.clip(offset, -limit_px, limit_px), 0.0)
 
 
-def _alike(profiles: NDArray[np.float64], mean: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _alike(profiles: Floats, mean: Floats, seen: Mask) -> Mask:
     """True (n,) where a profile (n, samples) has the form of the median one, and some of its contrast."""
     f = mean - mean.mean()
     levelled = profiles - profiles.mean(-1, keepdims=True)
     size, own, product = np.sqrt(np.sum(f * f)), np.sqrt(np.sum(levelled**2, -1)), levelled @ f
     faint = _FAINT * float(np.median(product[seen]))
-    return np.asarray((product > _LIKE * np.maximum(own * size, 1e-12)) & (product > faint))
+    alike: Mask = (product > _LIKE * np.maximum(own * size, 1e-12)) & (product > faint)
+    return alike
 
 
-def _wall_in(mean: NDArray[np.float64], walls: Walls) -> tuple[float, float, float, float]:
+def _wall_in(mean: Floats, walls: Walls) -> tuple[float, float, float, float]:
     """Position of the wall in a profile in px, its clarity, width of its line, distance of a line of another kind."""
     fine = np.linspace(0, len(mean) - 1, 8 * (len(mean) - 1) + 1)
     f = np.interp(fine, np.arange(len(mean)), mean)
     t = (fine - (len(mean) - 1) / 2) * _STEP_PX
-    edge = max(len(f) // 8, 1)
-    solid, fluid = float(f[:edge].mean()), float(f[-edge:].mean())
-    whole = max(float(np.ptp(f)), 1e-12)
-    if walls == "step":
-        above = f > math.log(0.5 * (math.exp(solid) + math.exp(fluid)))  # half-way in light, not in its logarithm
-        crossings = np.flatnonzero(above[1:] != above[:-1])
-        at_px = float(t[crossings[np.argmin(np.abs(t[crossings]))]]) if len(crossings) else 0.0
-        return at_px, abs(fluid - solid) / whole, 0.0, 0.0
     g = -f if walls == "dark" else f
-    low, high = (-solid, -fluid) if walls == "dark" else (solid, fluid)
+    edge = max(len(g) // 8, 1)
+    low, high = float(g[:edge].mean()), float(g[-edge:].mean())
+    whole = max(float(np.ptp(g)), 1e-12)
+    if walls == "step":
+        above = g > math.log(0.5 * (math.exp(low) + math.exp(high)))  # half-way in light, not in its logarithm
+        crossings = t[:-1][above[1:] != above[:-1]]
+        at_px = float(crossings[np.argmin(np.abs(crossings))]) if len(crossings) else 0.0
+        return at_px, abs(high - low) / whole, 0.0, 0.0
     middle = slice(edge, -edge)
     top, other = edge + int(np.argmax(g[middle])), edge + int(np.argmin(g[middle]))
     tall, deep = float(g[top]) - max(low, high), min(low, high) - float(g[other])
@@ -317,21 +336,19 @@ def _wall_in(mean: NDArray[np.float64], walls: Walls) -> tuple[float, float, flo
     return at_px, tall / whole, line_px, between_px
 
 
-def _ends(line: NDArray[np.float64], t: NDArray[np.float64], top: int, lost: float) -> tuple[float, float]:
+def _ends(line: Floats, t: Floats, top: int, lost: float) -> tuple[float, float]:
     """Positions on either side at which a line with its highest sample at `top` has lost this part of its height."""
     less = line < (1.0 - lost) * line[top]
     before, after = np.flatnonzero(less[:top]), np.flatnonzero(less[top:])
     return float(t[before[-1] if len(before) else 0]), float(t[top + after[0] if len(after) else -1])
 
 
-def _explained_edges(image: Floats, curves: list[Points], reach_px: float) -> float:
+def _explained_edges(image: Levels, curves: list[Floats], reach_px: float) -> float:
     """Part of the picture's edges that are near the outline, less what chance would give; 1 is all."""
     steep = np.hypot(*gradient(blur_image(image, max(1.5, reach_px / 3.0))))
-    near = np.zeros(image.shape, np.uint8)
-    drawn = [np.rint(curve * 16).astype(np.int32) for curve in curves]
-    cv2.polylines(near, drawn, True, 1, 2 * round(min(reach_px, 8.0)) + 1, cv2.LINE_8, 4)
-    line = np.zeros(image.shape, np.uint8)
-    cv2.polylines(line, drawn, True, 1, 3, cv2.LINE_8, 4)
+    near, line = (
+        draw_curves(np.zeros(image.shape, np.uint8), curves, width) for width in (2 * round(min(reach_px, 8.0)) + 1, 3)
+    )
     if not line.any() or near.all():
         return 0.0
     typical = float(np.percentile(cv2.dilate(steep, np.ones((7, 7), np.uint8))[line > 0], 50))

@@ -1,43 +1,87 @@
-"""Registration of a chip in one picture: search, sub-pixel fit, and a verdict.
+"""Registration of a chip in one picture: search, sub-pixel fit, and a verdict; and the comparison with a stated one.
 
 Nothing is chosen silently: poses that explain the picture equally well are all returned (a chip may be symmetric), and
 a picture that does not show the chip, or not enough of it, is refused.
+
+The orientation (of eight) and the scale in which a picture shows its chip are compared with those of a registration:
+the directions of the walls (wall_search.py) in all eight at once, which takes some hundredths of a second. Only another
+orientation than the stated one is then fitted (wall_fit.py), and it contradicts only where that fit finds the walls and
+the fit of the stated one does not.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import ChipError
-from flowrec.measure.wall_fit import Fitter, WallFit, WallMap
-from flowrec.measure.wall_search import WallSearch
-from flowrec.physics import AS_STATED, Calibration, Chip, median_width_um
+from flowrec.core import ChipError, Image
+from flowrec.measure.images import Colours, Mask, with_curves
+from flowrec.measure.wall_fit import Fitter, WallFit
+from flowrec.measure.wall_search import WallMap, WallSearch
+from flowrec.physics import (
+    AS_STATED,
+    ORIENTATIONS,
+    Calibration,
+    Chip,
+    Orientation,
+    camera_settings,
+    median_width_um,
+)
 
 _CANDIDATES = 12
 _LEAST_SCORE = 0.55  # of a candidate, relative to the best one
 _FIRST, _HOPELESS = 3, 0.5  # if of so many candidates none finds this part of the walls, the others are not tried
 _REACH_WIDTHS, _REACH_PX = 0.6, 6.0  # from the walls: in median channel widths, but at least so many camera pixels
-LEAST_FOUND = 0.7  # part of the walls
+_LEAST_FOUND = 0.7  # part of the walls
 _EQUAL_FOUND, _EQUAL_EXPLAINED = 0.1, 0.85  # less found by this, and explained at least by this factor: equally good
 _SAME_PX = 2.0  # two poses that differ by less are one
 _MOST_SHIFT_PX, _MOST_ANGLE_DEG, _MOST_SCALE = 0.5, 0.1, 0.003  # standard errors above which a picture is refused
 _OTHER_SCALE, _SIGNIFICANT = 0.02, 3.0  # relative difference, and standard errors, from which a scale is another one
 # Scales that are tried about an assumed one: a step moves the image's border by 2 of 480 px.
-_GROWTHS = (1.0, *np.geomspace(1.0 / 1.2, 1.2, 48).tolist())
+_NEAR_GROWTHS = (1.0, *np.geomspace(1.0 / 1.2, 1.2, 48).tolist())
 _NEAR_SCALE = 0.012  # relative difference from the assumed scale up to which the fit finds its way
-LEAST_PX, LEAST_CONTRAST = 32, 4.0  # shorter side and range of grey levels of a picture
+_LEAST_PX, _LEAST_CONTRAST = 32, 4.0  # shorter side and range of grey levels of a picture
+
+# Agreement of directions is 1 to 1.8 in sharp pictures, 0.8 with noise of the size of the walls' contrast; 0.6 at most
+# for a wrong orientation of the chips of the benchmarks, 0.1 as a rule.
+_SHOWN = 0.4  # agreement from which a picture shows walls
+_EQUAL = 0.85  # part of the best agreement from which an orientation is as good
+_LESS_FOUND = 0.1  # part of the walls that the stated orientation finds less than one that contradicts it
+_LEAST_SURE_DEG, _LEAST_SURE_SCALE = 2.0, 0.05  # standard errors of a fit above which it tells no angle or scale
+_MOST_GROWTH = 1.2  # factor by which the scale may be off, to either side
+# Scales that are tried, relative to the stated one: a step moves the image's border by 4 of 480 px.
+_GROWTHS = tuple(np.geomspace(0.5, 2.0, 91).tolist())
+
+
+class _ChipInPicture:
+    """A picture (h, w) and the chip that it may show."""
+
+    def __init__(self, picture: Image, chip: Chip) -> None:
+        self.chip, self.grey = chip, np.asarray(picture, np.float32)
+        self.middle_px = (np.array(self.grey.shape[::-1]) - 1) / 2
+        self.walls = WallMap(chip.mask, chip.um_per_px)
+        self.search = WallSearch(self.grey, self.walls)
+
+    def fitter(self, um_per_px: float) -> Fitter:
+        """Fits poses to the picture, which is of about this scale."""
+        reach_um = max(_REACH_WIDTHS * median_width_um(self.chip), _REACH_PX * um_per_px)
+        return Fitter(self.grey, self.walls, reach_um, um_per_px)
+
+
+def _is_small(picture: Image) -> bool:
+    return bool(min(picture.shape) < _LEAST_PX)
+
+
+def _is_blank(picture: Image) -> bool:
+    return float(np.ptp(picture)) < _LEAST_CONTRAST
 
 
 def register(
-    picture: NDArray[np.uint8 | np.uint16],
-    chip: Chip,
-    um_per_px: tuple[float, float],
-    mirrors: tuple[bool, ...] = (False, True),
+    picture: Image, chip: Chip, um_per_px: tuple[float, float], mirrors: tuple[bool, ...] = (False, True)
 ) -> tuple[WallFit, ...]:
     """The poses of a chip that explain a picture (h, w) equally well, best first; usually one.
 
@@ -47,15 +91,14 @@ def register(
     ------
     ChipError : one line: the picture does not show this chip, or does not determine how it lies.
     """
-    grey = np.asarray(picture, np.float32)
-    if min(grey.shape) < LEAST_PX:
-        least = f"{LEAST_PX} x {LEAST_PX}"
-        raise ChipError(f"the picture has {grey.shape[1]} x {grey.shape[0]} pixels; take one of at least {least}")
-    if float(np.ptp(grey)) < LEAST_CONTRAST:
+    if _is_small(picture):
+        least = f"{_LEAST_PX} x {_LEAST_PX}"
+        raise ChipError(f"the picture has {picture.shape[1]} x {picture.shape[0]} pixels; take one of at least {least}")
+    if _is_blank(picture):
         raise ChipError("the picture is blank; is the lamp on and the chip in view?")
-    walls = WallMap(chip.mask, chip.um_per_px)
-    poses = WallSearch(grey, chip.mask, chip.um_per_px, walls.clearance_um).candidates(um_per_px, mirrors, _CANDIDATES)
-    fitter = fitter_of(grey, chip, math.sqrt(um_per_px[0] * um_per_px[1]), walls)
+    scene = _ChipInPicture(picture, chip)
+    poses = scene.search.candidates(um_per_px, mirrors, _CANDIDATES)
+    fitter = scene.fitter(math.sqrt(um_per_px[0] * um_per_px[1]))
     fits: list[WallFit] = []
     for pose in poses:
         hopeless = len(fits) == _FIRST and max(fit.found for fit in fits) < _HOPELESS
@@ -66,43 +109,39 @@ def register(
     fits.sort(key=lambda fit: bool(_loose(fit).any()))
     distinct: list[WallFit] = []
     for fit in fits:
-        if all(_apart_px(fit.calibration, other.calibration, walls) > _SAME_PX for other in distinct):
+        if all(_apart_px(fit.calibration, other.calibration, scene.walls) > _SAME_PX for other in distinct):
             distinct.append(fit)
     distinct.sort(key=lambda fit: -fit.found * fit.explained)
-    if not distinct or distinct[0].found < LEAST_FOUND:
+    if not distinct or distinct[0].found < _LEAST_FOUND:
         found = 100.0 * distinct[0].found if distinct else 0.0
         raise ChipError(
             f"the picture does not show the chip {chip.name}: at best {found:.0f} % of its walls agree, "
-            f"{100 * LEAST_FOUND:.0f} % are needed; is it this chip, in focus, and is um_per_px about right?"
+            f"{100 * _LEAST_FOUND:.0f} % are needed; is it this chip, in focus, and is um_per_px about right?"
         )
     best = distinct[0]
-    equal = [
+    _refuse_undetermined(best, chip)
+    return tuple(
         fit
         for fit in distinct
         if fit.found >= best.found - _EQUAL_FOUND and fit.explained >= _EQUAL_EXPLAINED * best.explained
-    ]
-    _refuse_undetermined(best, chip)
-    return tuple(equal)
+    )
 
 
-def fit_nearby(picture: NDArray[np.uint8 | np.uint16], chip: Chip, assumed: Calibration) -> WallFit | None:
+def fit_nearby(picture: Image, chip: Chip, assumed: Calibration) -> WallFit | None:
     """The pose in a picture (h, w) near an assumed one, whose scale may be off by a fifth.
 
     None if the picture does not show the walls nearby.
     """
-    grey = np.asarray(picture, np.float32)
-    if min(grey.shape) < LEAST_PX or float(np.ptp(grey)) < LEAST_CONTRAST:
+    if _is_small(picture) or _is_blank(picture):
         return None
-    walls = WallMap(chip.mask, chip.um_per_px)
-    search = WallSearch(grey, chip.mask, chip.um_per_px, walls.clearance_um)
-    middle_px = (np.array(grey.shape[::-1]) - 1) / 2
-    grown = [AS_STATED.about(assumed, middle_px, growth) for growth in _GROWTHS]
-    likely = max(grown, key=search.agreement)
+    scene = _ChipInPicture(picture, chip)
+    grown = [AS_STATED.about(assumed, scene.middle_px, growth) for growth in _NEAR_GROWTHS]
+    likely = max(grown, key=scene.search.agreement)
     near = abs(math.log(likely.um_per_px / assumed.um_per_px)) < _NEAR_SCALE
     starts = [assumed] if near else [assumed, likely]
-    fits = [fitter_of(grey, chip, start.um_per_px, walls).fit(start) for start in starts]
+    fits = [scene.fitter(start.um_per_px).fit(start) for start in starts]
     best = max(fits, key=lambda fit: fit.found * fit.explained)
-    return best if best.found >= LEAST_FOUND else None
+    return best if best.found >= _LEAST_FOUND else None
 
 
 def moved_px(fit: WallFit, chip: Chip, assumed: Calibration) -> float | None:
@@ -120,50 +159,123 @@ def other_scale(fit: WallFit, assumed: Calibration) -> float | None:
     return fit.calibration.um_per_px if contradicts else None
 
 
-def fitter_of(grey: NDArray[np.float32], chip: Chip, um_per_px: float, walls: WallMap) -> Fitter:
-    """Fits poses of a chip to a picture (h, w) of about this scale."""
-    return Fitter(grey, walls, max(_REACH_WIDTHS * median_width_um(chip), _REACH_PX * um_per_px), um_per_px)
-
-
 def _apart_px(one: Calibration, other: Calibration, walls: WallMap) -> float:
     """Root mean square distance of the walls of two poses in the image."""
     off = one.to_px(walls.points_um) - other.to_px(walls.points_um)
     return float(np.sqrt(np.mean(np.sum(off * off, -1))))
 
 
-def _loose(fit: WallFit) -> NDArray[np.bool_]:
+def _loose(fit: WallFit) -> Mask:
     """(4,) which of shift along x and y, angle and scale the picture does not determine."""
     shift_um = _MOST_SHIFT_PX * fit.calibration.um_per_px
     return ~(fit.std < (shift_um, shift_um, _MOST_ANGLE_DEG, _MOST_SCALE))
 
 
 def _refuse_undetermined(fit: WallFit, chip: Chip) -> None:
-    names = ("the shift along x ({:.3g} um)", "the shift along y ({:.3g} um)", "the angle ({:.2g} degrees)")
-    shown = [name.format(value) for name, value in zip(names, fit.std.tolist(), strict=False)]
-    shown.append(f"the scale ({100 * fit.std[3]:.2g} %)")
-    loose = [text for text, bad in zip(shown, _loose(fit).tolist(), strict=True) if bad]
+    x, y, angle, scale = fit.std.tolist()
+    shown = (
+        f"the shift along x ({x:.3g} um)",
+        f"the shift along y ({y:.3g} um)",
+        f"the angle ({angle:.2g} degrees)",
+        f"the scale ({100 * scale:.2g} %)",
+    )
+    loose = " and ".join(text for text, bad in zip(shown, _loose(fit), strict=True) if bad)
     if not loose:
         return
     if not _loose(replace(fit, std=fit.apart)).any():
         raise ChipError(
-            f"the walls of {chip.name} in the picture do not determine {' and '.join(loose)}; show more of the chip, "
-            "with walls of several directions"
+            f"the walls of {chip.name} in the picture do not determine {loose}; show more of the chip, with walls of "
+            "several directions"
         )
     raise ChipError(
-        f"grey levels and local contrast of the picture put {chip.name} in different places: they disagree on "
-        f"{' and '.join(loose)}; is it this chip, in focus, and is the light even from all sides?"
+        f"grey levels and local contrast of the picture put {chip.name} in different places: they disagree on {loose}; "
+        "is it this chip, in focus, and is the light even from all sides?"
     )
 
 
-def overlay(picture: NDArray[np.uint8 | np.uint16], chip: Chip, calibration: Calibration) -> NDArray[np.uint8]:
+def overlay(picture: Image, chip: Chip, calibration: Calibration) -> Colours:
     """The picture (h, w, 3), blue first, with the outline of the chip as it was found, in orange."""
-    grey = picture.astype(np.float32)
-    low, high = np.percentile(grey, (0.5, 99.5))
-    shown = np.clip(255.0 * (grey - low) / max(float(high - low), 1.0), 0, 255).astype(np.uint8)
-    drawn = np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR), np.uint8)
     contours, _ = cv2.findContours(chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    wide = max(1, round(max(grey.shape) / 800))
-    for contour in contours:
-        at = calibration.to_px(contour[:, 0] * chip.um_per_px)
-        cv2.polylines(drawn, [np.rint(16 * at).astype(np.int32)], True, (0, 140, 255), wide, cv2.LINE_AA, 4)
-    return drawn
+    return with_curves(picture, (calibration.to_px(contour[:, 0] * chip.um_per_px) for contour in contours))[0]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageVerdict:
+    """Result of the comparison of the axes with a picture.
+
+    Attributes
+    ----------
+    contradiction : one line with the settings to paste; '' if there is none.
+    alike : the orientations in the image that it shows equally well; () if it does not show enough of the walls.
+    """
+
+    contradiction: str
+    alike: tuple[Orientation, ...]
+
+    @property
+    def decided(self) -> bool:
+        """True if the stated orientation is the only one that the picture shows."""
+        return self.alike == (AS_STATED,) and not self.contradiction
+
+    @property
+    def text(self) -> str:
+        """The verdict in a sentence."""
+        if self.contradiction:
+            return self.contradiction
+        if self.decided:
+            return "the image shows the chip in the stated orientation"
+        if not self.alike:
+            return "the image does not tell the orientation of the chip: too few walls are where they should be"
+        others = ", ".join(each.name for each in self.alike if each != AS_STATED)
+        return f"the chip looks the same {others}: its image does not tell which it is"
+
+
+def orientation_by_image(picture: Image, chip: Chip, stated: Calibration) -> ImageVerdict:
+    """The verdict of a picture (h, w) on the stated registration."""
+    if _is_small(picture) or _is_blank(picture):
+        return ImageVerdict("", ())
+    scene = _ChipInPicture(picture, chip)
+
+    def pose(orientation: Orientation, growth: float) -> Calibration:
+        return orientation.about(stated, scene.middle_px, growth)
+
+    def score(orientations: Sequence[Orientation], growths: Sequence[float]) -> dict[tuple[Orientation, float], float]:
+        tried = [(each, growth) for each in orientations for growth in growths]
+        return {each: scene.search.agreement(pose(*each)) for each in tried}
+
+    scores = score(ORIENTATIONS, (1.0,)) | score((AS_STATED,), _GROWTHS)
+    if max(scores.values()) < _SHOWN:
+        scores |= score(ORIENTATIONS, _GROWTHS)
+    least = max(_EQUAL * max(scores.values()), _SHOWN)
+    if scores[AS_STATED, 1.0] >= least:
+        growth = 1.0
+    else:
+        _, growth = max(scores, key=lambda each: scores[each])
+        scores |= score(ORIENTATIONS, (growth,))
+    alike = tuple(each for each in ORIENTATIONS if scores[each, growth] >= least)
+    if AS_STATED in alike and 1.0 / _MOST_GROWTH < growth < _MOST_GROWTH:
+        return ImageVerdict("", alike)
+    fitter = scene.fitter(stated.um_per_px * growth)
+    fits = {each: fitter.fit(pose(each, growth)) for each in alike}
+    # Where along a straight channel, a picture that shows the walls need not tell.
+    shown = {each: fit for each, fit in fits.items() if fit.found >= _LEAST_FOUND and fit.std[2] < _LEAST_SURE_DEG}
+    if not shown:
+        return ImageVerdict("", ())
+    best = max(shown.values(), key=lambda fit: fit.found)
+    if scene.fitter(stated.um_per_px).fit(stated).found > best.found - _LESS_FOUND:
+        return ImageVerdict("", ())
+    ratio = best.calibration.um_per_px / stated.um_per_px if best.std[3] < _LEAST_SURE_SCALE else 1.0
+    return ImageVerdict(_contradiction(tuple(shown), ratio, stated), tuple(shown))
+
+
+def _contradiction(shown: tuple[Orientation, ...], ratio: float, stated: Calibration) -> str:
+    """The line on a picture that shows a chip in other orientations or at another scale, with the settings of each."""
+    found, sets = [], [""]
+    if AS_STATED not in shown:
+        found.append(" or ".join(each.name for each in shown))
+        sets = [camera_settings(each.seen_by(stated)) for each in shown]
+    if not 1.0 / _MOST_GROWTH < ratio < _MOST_GROWTH:
+        um_per_px = ratio * stated.um_per_px
+        found.append(f"at {um_per_px:.4g} um per pixel instead of {stated.um_per_px:.4g}")
+        sets = [", ".join(filter(None, (each, f"camera.um_per_px = {um_per_px:.4g}"))) for each in sets]
+    return f"the image shows the chip {', '.join(found)}: set {', or '.join(sets)}" if found else ""

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import Coverage, Image, UsageError
-from flowrec.movies import ReadOptions, open_movie
+from flowrec.movies import ReadOptions, median_of, open_movie
 from flowrec.rigs import sha256_of
 from flowrec.store import open as open_session
 
@@ -24,14 +23,12 @@ class SourcePicture:
     Attributes
     ----------
     image : (h, w) grey levels.
-    bits : depth of a pixel.
     source : name of the file, and what was made of it.
     sha256 : of the file.
     covered : the images of which it is the median, of all.
     """
 
     image: Image
-    bits: int
     source: str
     sha256: str
     covered: Coverage
@@ -49,16 +46,16 @@ def read_picture(path: Path, channel: str | None = None) -> SourcePicture:
     if not path.exists():
         raise UsageError(f"{path}: no such picture; it is an image file, a movie, or a session")
     if path.suffix == ".mcap":
-        image, bits, covered = _of_session(path)
+        image, covered = _of_session(path)
     else:
         with open_movie(path, options=ReadOptions(channel)) as movie:
-            image, bits, frames = movie.median_image(), movie.facts.bits, movie.facts.frames
-            covered = Coverage(len(movie.median_indices()), frames, "images")
+            image = movie.median_image()
+            covered = Coverage(len(movie.median_indices()), movie.facts.frames, "images")
     source = path.name if covered.total == 1 else f"{path.name}, median of {covered.amount}"
-    return SourcePicture(image, bits, source, sha256_of(path), covered)
+    return SourcePicture(image, source, sha256_of(path), covered)
 
 
-def png_of(image: Image | NDArray[np.uint8]) -> bytes:
+def png_of(image: Image) -> bytes:
     """An image as a PNG file, grey or BGR; ValueError if it can not be one."""
     done, png = cv2.imencode(".png", image)
     if not done:
@@ -66,17 +63,11 @@ def png_of(image: Image | NDArray[np.uint8]) -> bytes:
     return png.tobytes()
 
 
-def _of_session(path: Path) -> tuple[Image, int, Coverage]:
+def _of_session(path: Path) -> tuple[Image, Coverage]:
     session = open_session(path)
     times = np.unique(np.linspace(0.0, session.duration_s, _IMAGES))
-    frames = {}
-    for time_s in times.tolist():
-        frame = session.at(time_s).frame
-        if frame is not None and frame.image.size:
-            frames[frame.index] = frame
-    if not frames:
+    frames = (session.at(time_s).frame for time_s in times.tolist())
+    images = {frame.index: frame.image for frame in frames if frame is not None and frame.image.size}
+    if not images:
         raise UsageError(f"{path}: holds no images; take a session that was recorded with them")
-    stack = np.stack([frame.image for frame in frames.values()])
-    image: Image = np.median(stack, axis=0, overwrite_input=True).round().astype(stack.dtype)
-    covered = Coverage(len(frames), session.topics.get("/camera/frame", len(frames)), "images")
-    return image, next(iter(frames.values())).bits, covered
+    return median_of(images.values()), Coverage(len(images), session.topics.get("/camera/frame", len(images)), "images")

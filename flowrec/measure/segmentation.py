@@ -20,13 +20,13 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import ChipError
+from flowrec.core import ChipError, Image
+from flowrec.measure.images import Floats, Levels, Mask, blur_image, draw_curves, shrink
 from flowrec.measure.outline import Outline, Walls, outline_of
 from flowrec.measure.wall_lines import divisions, otsu
-from flowrec.measure.wall_search import blur_image
 from flowrec.physics import MAX_PIXELS, border, find_openings
 
-Floats = NDArray[np.float32]
+Seeds = Sequence[tuple[int, int]]  # column and row of points in the channel
 Shown = Literal["auto", "dark", "bright", "step", "relief"]
 _WORK_PX = 640  # longest side of the picture in which the channel is searched
 _ROUNDS = 12  # of light and levels
@@ -81,10 +81,7 @@ class Segmentation:
     def through(self) -> float:
         """Part of the channel that fluid can flow through: pieces that meet the border of the picture twice."""
         mask = self.outline.mask()
-        labels, count = scipy.ndimage.label(mask)
-        ends = np.zeros(count + 1, np.int64)
-        for opening in find_openings(mask):
-            ends[border(labels, opening.side)[opening.first]] += 1
+        labels, ends = _pieces(mask)
         return float(np.mean((ends >= 2)[labels[mask]])) if mask.any() else 0.0
 
     @property
@@ -105,9 +102,7 @@ class Segmentation:
         }
 
 
-def segment(
-    picture: NDArray[np.uint8 | np.uint16], shown: Shown = "auto", seeds_px: Sequence[tuple[float, float]] = ()
-) -> Segmentation:
+def segment(picture: Image, shown: Shown = "auto", seeds_px: Sequence[tuple[float, float]] = ()) -> Segmentation:
     """The channel in a picture (h, w).
 
     Parameters
@@ -130,39 +125,36 @@ def segment(
             raise ChipError(f"the point {x:g},{y:g} is outside of the picture, which is {width} x {height} pixels")
     step = max(1.0, max(full.shape) / _WORK_PX)
     size = max(round(width / step), 1), max(round(height / step), 1)
-    grey = full if step == 1.0 else np.asarray(cv2.resize(full, size, interpolation=cv2.INTER_AREA), np.float32)
+    grey = full if step == 1.0 else shrink(full, size)
     scale = np.array((width, height)) / size
     seeds = [(min(int((x + 0.5) / scale[0]), size[0] - 1), min(int((y + 0.5) / scale[1]), size[1] - 1))
              for x, y in seeds_px]  # fmt: skip
-    light = np.asarray(np.log(grey + 0.02 * float(grey.max()) + 1.0), np.float32)
-    found = list(hypotheses(light, shown, seeds))
-    if seeds and (split := [each for each in found if not _holds_seeds(each, seeds)]) and len(split) == len(found):
+    found = list(hypotheses(np.log(grey + 0.02 * float(grey.max()) + 1.0), shown, seeds))
+    whole = [each for each in found if _holds_seeds(each, seeds)]
+    if found and not whole:
         raise ChipError(
             "the points lie on both sides of a wall, so they can not all be in the channel; give fewer points, or say "
             "how walls show (--walls)"
         )
-    chosen = _choose([each for each in found if _holds_seeds(each, seeds)])
-    curves = tuple((curve + 0.5) * scale - 0.5 for curve in chosen.outline.curves)
-    bigger = float(np.sqrt(scale[0] * scale[1]))
-    outline = replace(
-        chosen.outline,
-        curves=curves,
-        size_px=(width, height),
-        width_px=chosen.outline.width_px * bigger,
-        gap_px=chosen.outline.gap_px * bigger,
-        line_px=chosen.outline.line_px * bigger,
-        rough_px=chosen.outline.rough_px * bigger,
-        between_px=chosen.outline.between_px * bigger,
-    )
-    return replace(chosen, outline=outline)
+    chosen = _choose(whole)
+    return replace(chosen, outline=chosen.outline.enlarge((width, height)))
 
 
-def _holds_seeds(found: Segmentation, seeds: Sequence[tuple[int, int]]) -> bool:
+def _holds_seeds(found: Segmentation, seeds: Seeds) -> bool:
     mask = found.outline.mask()
     return all(mask[y, x] for x, y in seeds)
 
 
-def chip_mask(found: Segmentation, um_per_px: float) -> tuple[NDArray[np.bool_], float]:
+def _pieces(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Numbers (h, w) of the pieces of a channel, from 1, and how often each meets the border of the picture."""
+    labels, count = scipy.ndimage.label(mask)
+    ends = np.zeros(count + 1, np.int64)
+    for opening in find_openings(mask):
+        ends[border(labels, opening.side)[opening.first]] += 1
+    return labels, ends
+
+
+def chip_mask(found: Segmentation, um_per_px: float) -> tuple[Mask, float]:
     """The channel as a mask (h, w) over the picture's centre, and the size of its pixels.
 
     The mask has the pixels of the picture; where that would be too many for the solver, whole squares of them, and
@@ -246,9 +238,7 @@ def _walls_of(lines: Segmentation, step: Segmentation) -> bool:
     if o.support < _SUPPORT or o.clear < _CLEAR[lines.shown] or o.width_px < 1.2 * width_px:
         return False
     mask = step.outline.mask()
-    near = np.zeros(mask.shape, np.uint8)
-    drawn = [np.rint(curve * 16).astype(np.int32) for curve in o.curves]
-    cv2.polylines(near, drawn, True, 1, 2 * round(0.5 * width_px) + 3, cv2.LINE_8, 4)
+    near = draw_curves(np.zeros(mask.shape, np.uint8), o.curves, 2 * round(0.5 * width_px) + 3)
     return bool(near[mask].mean() > _ALONG)
 
 
@@ -277,16 +267,17 @@ def _faults(found: Segmentation) -> str:
     return ""
 
 
-def hypotheses(light: Floats, shown: Shown, seeds: Sequence[tuple[int, int]]) -> Iterator[Segmentation]:
+def hypotheses(light: Levels, shown: Shown, seeds: Seeds) -> Iterator[Segmentation]:
     """Channels in the logarithm of a picture (h, w), good and bad ones."""
-    images: list[tuple[Shown, Walls, Floats]] = [
-        ("dark", "dark", -light), ("bright", "bright", light), ("relief", "bright", _deviation(light))
+    uneven = blur_image(np.abs(blur_image(light, 1.0) - blur_image(light, 10.0)), 1.0)
+    images: list[tuple[Shown, Walls, Levels]] = [
+        ("dark", "dark", -light), ("bright", "bright", light), ("relief", "bright", uneven)
     ]  # fmt: skip
     enough = False
     for kind, walls, image in images:
         if shown not in ("auto", kind) or (kind == "relief" and enough):
             continue
-        before: list[NDArray[np.bool_]] = []
+        before: list[Mask] = []
         for parts, agreed in divisions(image):
             if agreed < _LEAST_AGREED and shown == "auto":
                 continue
@@ -301,49 +292,36 @@ def hypotheses(light: Floats, shown: Shown, seeds: Sequence[tuple[int, int]]) ->
                 yield found
     if shown in ("auto", "step"):
         parts, contrast = _levels(light)
-        mask = _channel(_remove_debris(parts), seeds) if contrast > _LEAST_CONTRAST else np.zeros(light.shape, np.bool_)
-        if _possible(mask, seeds):
+        if contrast > _LEAST_CONTRAST and _possible(mask := _channel(_remove_debris(parts), seeds), seeds):
             outline = outline_of(light, mask, "step")
             if outline is not None:
                 yield Segmentation(outline, "step", 1.0)
 
 
-def _deviation(light: Floats) -> Floats:
-    """Absolute deviation of each pixel from its surroundings."""
-    return blur_image(np.abs(blur_image(light, 1.0) - blur_image(light, 10.0)), 1.0)
-
-
-def _possible(mask: NDArray[np.bool_], seeds: Sequence[tuple[int, int]]) -> bool:
+def _possible(mask: Mask, seeds: Seeds) -> bool:
     return _LEAST_AREA < float(mask.mean()) < (0.99 if seeds else _MOST_AREA)
 
 
-def iou(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+def iou(one: Mask, other: Mask) -> float:
     """Intersection over union of two masks."""
     return float(np.count_nonzero(one & other)) / max(float(np.count_nonzero(one | other)), 1.0)
 
 
-def _channel(parts: NDArray[np.bool_], seeds: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
+def _channel(parts: Mask, seeds: Seeds) -> Mask:
     """The channel of two kinds of parts."""
+    channel = bool(parts[seeds[0][::-1]]) if seeds else _solid(parts) <= _solid(~parts)
+    mask = _remove_debris(parts if channel else ~parts)
+    labels, ends = _pieces(mask)
     if seeds:
-        kinds = [bool(parts[y, x]) for x, y in seeds]
-        mask = _remove_debris(parts if kinds[0] else ~parts)
-    else:
-        mask = _remove_debris(parts if _solid(parts) <= _solid(~parts) else ~parts)
-    labels, count = scipy.ndimage.label(mask)
-    if seeds:
-        mask = np.isin(labels, [labels[y, x] for x, y in seeds if labels[y, x]])
-    elif count > 1:  # what lies apart from the channel, and does not reach the border twice, is no channel
-        areas = np.bincount(labels.ravel(), minlength=count + 1)
-        areas[0] = 0
-        kept = areas >= 0.3 * areas.max()
-        ends = np.zeros(count + 1, np.int64)
-        for opening in find_openings(mask):
-            ends[border(labels, opening.side)[opening.first]] += 1
-        mask = (kept | (ends >= 2))[labels] & mask
-    return np.asarray(mask)
+        return np.isin(labels, [labels[y, x] for x, y in seeds if labels[y, x]])
+    # What lies apart from the channel, and does not reach the border twice, is no channel.
+    areas = np.bincount(labels.ravel(), minlength=len(ends))
+    areas[0] = 0
+    kept: Mask = (areas >= 0.3 * areas.max()) | (ends >= 2)
+    return kept[labels] & mask
 
 
-def _solid(parts: NDArray[np.bool_]) -> tuple[int, float]:
+def _solid(parts: Mask) -> tuple[int, float]:
     """Sort key that is higher for the solid than for the channel: number of the picture's corners, then width."""
     if parts.all() or not parts.any():
         return 4 * int(parts.all()), 0.0
@@ -352,7 +330,7 @@ def _solid(parts: NDArray[np.bool_]) -> tuple[int, float]:
     return int(np.count_nonzero(corners)), float(np.mean(distance[8:-8, 8:-8][parts]))
 
 
-def _levels(light: Floats) -> tuple[NDArray[np.bool_], float]:
+def _levels(light: Levels) -> tuple[Mask, float]:
     """The brighter of two levels (h, w), and their distance in standard deviations of what is left."""
     height, width = light.shape
     step = max(1, min(height, width) // 100)
@@ -360,36 +338,29 @@ def _levels(light: Floats) -> tuple[NDArray[np.bool_], float]:
     x, y = np.meshgrid(np.linspace(-1, 1, width, dtype=np.float32), np.linspace(-1, 1, height, dtype=np.float32))
     terms = np.stack((np.ones_like(x), x, y, x * x, x * y, y * y), -1)
     few, values = terms[::step, ::step].reshape(-1, 6), smooth[::step, ::step].reshape(-1)
-    best: tuple[float, NDArray[np.float64], float] | None = None
-    for start in ("flat", "bright", "dark"):
-        weights = np.ones(len(values), np.bool_)
-        if start != "flat":
-            middle = float(np.median(values))
-            weights = values < middle if start == "bright" else values > middle
-        fit = np.asarray(np.linalg.lstsq(few[weights], values[weights], rcond=None)[0], np.float64)
-        above = np.zeros(len(values), np.bool_)
+    best: tuple[float, Floats, float] = 0.0, np.zeros(6), math.inf
+    middle = float(np.median(values))
+    for start in (np.ones(len(values), np.bool_), values < middle, values > middle):
+        fit = np.asarray(np.linalg.lstsq(few[start], values[start], rcond=None)[0], np.float64)
         for _ in range(_ROUNDS):
             rest = values - few @ fit
             above = rest > otsu(rest)
             if above.all() or not above.any():
                 break
-            found = np.linalg.lstsq(np.column_stack((few, above)), values, rcond=None)[0]
-            fit = found[:6]
+            fit = np.linalg.lstsq(np.column_stack((few, above)), values, rcond=None)[0][:6]
         if above.all() or not above.any():
             continue
         rest = values - few @ fit
         levels = float(np.median(rest[~above])), float(np.median(rest[above]))
         off = np.where(above, rest - levels[1], rest - levels[0])
         contrast = (levels[1] - levels[0]) / max(1.4826 * float(np.median(np.abs(off))), 1e-6)
-        if best is None or contrast > best[0]:  # half-way in light, not in its logarithm
+        if contrast > best[0]:  # half-way in light, not in its logarithm
             best = contrast, fit, float(np.log(0.5 * (np.exp(levels[0]) + np.exp(levels[1]))))
-    if best is None:
-        return np.zeros(light.shape, np.bool_), 0.0
     contrast, fit, threshold = best
-    return np.asarray(smooth - terms @ fit > threshold), contrast
+    return smooth - terms @ fit > threshold, contrast
 
 
-def _remove_debris(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _remove_debris(mask: Mask) -> Mask:
     """Without debris: small pieces and small holes."""
     most = _SPECK * mask.size
     for _ in range(2):

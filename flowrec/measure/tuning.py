@@ -15,7 +15,7 @@ from flowrec.core import Applied, Estimate, FlowField, Track, UsageError, second
 from flowrec.physics import Robot
 from flowrec.stages import Kalman
 
-EXPECTED_NIS = 2.0
+_EXPECTED_NIS = 2.0
 _INTERVAL_S = 0.5  # over which the drift of a parked robot is taken as quadratic
 _LEAST_INTERVALS = 3
 _LEAST_SAMPLES = 8
@@ -88,23 +88,6 @@ def moving_noise(tracks: Sequence[Track], applied: Sequence[Applied], robot: Rob
     return _STD_PER_MAD * float(np.median(np.abs(third[complete]))) / math.sqrt(20.0)  # 1 + 9 + 9 + 1
 
 
-def mean_nis(
-    kalman: Kalman,
-    tracks: Sequence[Track],
-    applied: Sequence[Applied],
-    robot: Robot,
-    fields: Sequence[FlowField | None] | None = None,
-) -> float:
-    """Mean NIS of a filter over a recording; values beyond the gate count as the gate. NaN without innovations."""
-    found: list[float] = []
-    last: Estimate | None = None
-    for index, (track, one_applied) in enumerate(zip(tracks, applied, strict=True)):
-        last = kalman.estimate(last, track, one_applied, robot, None if fields is None else fields[index])
-        if index >= _SETTLING and math.isfinite(last.nis):
-            found.append(min(last.nis, kalman.gate_nis))
-    return float(np.mean(found)) if found else math.nan
-
-
 def tune(
     tracks: Sequence[Track],
     applied: Sequence[Applied],
@@ -121,7 +104,18 @@ def tune(
     ------
     UsageError : the recording is too short.
     """
-    before = mean_nis(kalman, tracks, applied, robot, fields)
+
+    def mean_nis(kalman: Kalman) -> float:
+        """Mean NIS of a filter over the recording; values beyond the gate count as the gate. NaN without any."""
+        found: list[float] = []
+        last: Estimate | None = None
+        for index, (track, one_applied) in enumerate(zip(tracks, applied, strict=True)):
+            last = kalman.estimate(last, track, one_applied, robot, None if fields is None else fields[index])
+            if index >= _SETTLING and math.isfinite(last.nis):
+                found.append(min(last.nis, kalman.gate_nis))
+        return float(np.mean(found)) if found else math.nan
+
+    before = mean_nis(kalman)
     noise, rest_s = parked_noise(tracks, applied)
     source = "parked" if noise > 0.0 else "moving"
     if source == "moving":
@@ -134,10 +128,9 @@ def tune(
     low, high = (math.log(end) for end in _AGILITY)
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        if mean_nis(replace(kalman, agility=math.exp(middle)), tracks, applied, robot, fields) > EXPECTED_NIS:
+        if mean_nis(replace(kalman, agility=math.exp(middle))) > _EXPECTED_NIS:
             low = middle
         else:
             high = middle
     agility = math.exp(high)
-    nis = mean_nis(replace(kalman, agility=agility), tracks, applied, robot, fields)
-    return Tuned(noise, source, agility, nis, before, rest_s)
+    return Tuned(noise, source, agility, mean_nis(replace(kalman, agility=agility)), before, rest_s)

@@ -32,11 +32,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import cells_at
-from flowrec.measure.wall_search import Points, blur_image, gradient, move_chip
-from flowrec.physics import Calibration, clearance_um
+from flowrec.measure.images import Floats, Levels, blur_image, gradient, shrink
+from flowrec.measure.wall_search import WallMap, move_chip
+from flowrec.physics import Calibration
 
 Stages = tuple[tuple[float, int, float], ...]
+Indices = NDArray[np.intp]
 _LONGEST_PX = 1280  # side of the image that is fitted
 # Blur, most pixels, and the motion in px at which Gauss-Newton ends; one row after the other.
 _STAGES = ((4.0, 30_000, 0.05), (2.0, 30_000, 0.05), (1.0, 30_000, 0.02), (0.0, 100_000, 0.003))
@@ -74,48 +75,8 @@ class WallFit:
     found: float
     seen: float
     residual_um: float
-    std: NDArray[np.float64]
-    apart: NDArray[np.float64]
-
-
-class WallMap:
-    """Smooth signed distance to the walls of a mask, in um, also a little beyond its border.
-
-    Attributes
-    ----------
-    clearance_um : (h, w).
-    size_um : width and height of the mask.
-    points_um : (n, 2) pixel centres beside the walls.
-    """
-
-    def __init__(self, mask: NDArray[np.bool_], um_per_px: float) -> None:
-        pad = 4
-        distance = clearance_um(np.pad(mask, pad, mode="edge"), um_per_px)
-        smooth = cv2.GaussianBlur(distance, (0, 0), 1.0)[pad:-pad, pad:-pad]
-        self.clearance_um = np.ascontiguousarray(smooth, np.float32)
-        self._um = um_per_px
-        down, right = np.gradient(self.clearance_um, um_per_px)
-        height, width = mask.shape
-        self.size_um = (width * um_per_px, height * um_per_px)
-        rows, columns = np.nonzero(np.abs(self.clearance_um) < um_per_px)
-        self.points_um = np.stack((columns, rows), -1) * um_per_px
-        self._all = np.stack((self.clearance_um, right, down), -1)
-
-    def at(self, points_um: Points) -> tuple[NDArray[np.float64], Points, NDArray[np.bool_]]:
-        """Distances (n,), their gradients (n, 2), and whether the points (n, 2) lie on the mask (n,)."""
-        cells = cells_at(points_um / self._um, self.clearance_um.shape)
-        found = cells.interpolate(self._all)
-        return found[:, 0], found[:, 1:], cells.inside
-
-    def draw_distances(self, to_um: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Distances (h, w) at the pixels of an image, roughly; infinite beside the mask.
-
-        `to_um` (2, 3) takes (column, row, 1) of a pixel to the chip.
-        """
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        size, to_px = (shape[1], shape[0]), to_um / self._um
-        drawn = cv2.warpAffine(self.clearance_um, to_px, size, flags=flags, borderValue=math.inf)
-        return np.asarray(drawn, np.float32)
+    std: Floats
+    apart: Floats
 
 
 class Fitter:
@@ -129,19 +90,20 @@ class Fitter:
     um_per_px : of the picture, roughly.
     """
 
-    def __init__(self, picture: NDArray[np.float32], walls: WallMap, reach_um: float, um_per_px: float) -> None:
+    def __init__(self, picture: Levels, walls: WallMap, reach_um: float, um_per_px: float) -> None:
         self._walls, self._reach_um = walls, reach_um
-        self._size_px = (picture.shape[1], picture.shape[0])
+        self._size_px = np.array(picture.shape[::-1])
+        self._middle_px = (self._size_px - 1) / 2
         step = max(1.0, max(picture.shape) / _LONGEST_PX)
-        small = np.asarray(picture, np.float32)
+        small = picture
         if step > 1.0:
             height, width = (round(n / step) for n in picture.shape)
-            small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+            small = shrink(picture, (width, height))
         # Pixels of the picture to one of those that are fitted, along x and y.
-        self._step = np.array(self._size_px) / small.shape[::-1]
+        self._step = self._size_px / small.shape[::-1]
         self._sigma_px = 2.0 * reach_um / (um_per_px * step)
         self._levelled = _level_contrast(small, 2.0 * self._sigma_px)
-        self._contrasts: dict[float, NDArray[np.float32]] = {}
+        self._contrasts: dict[float, Levels] = {}
 
     def fit(self, start: Calibration) -> WallFit:
         """The pose near a first one, by both readings."""
@@ -159,30 +121,27 @@ class Fitter:
             return contrast
         return replace(grey, std=np.hypot(grey.std, apart), apart=apart)
 
-    def _apart(self, one: WallFit, other: WallFit) -> NDArray[np.float64]:
+    def _apart(self, one: WallFit, other: WallFit) -> Floats:
         """(4,) difference of two poses, in the units of `WallFit.std`."""
         a, b = one.calibration, other.calibration
-        middle = (np.array(self._size_px) - 1) / 2
         turned = (a.angle_deg - b.angle_deg + 180.0) % 360.0 - 180.0
-        return np.abs((*(a.to_um(middle) - b.to_um(middle)), turned, math.log(a.um_per_px / b.um_per_px)))
+        shift_um = a.to_um(self._middle_px) - b.to_um(self._middle_px)
+        return np.abs((*shift_um, turned, math.log(a.um_per_px / b.um_per_px)))
 
-    def _grey(self, blur_px: float) -> NDArray[np.float32]:
+    def _grey(self, blur_px: float) -> Levels:
         return blur_image(self._levelled, blur_px) if blur_px > 0.0 else self._levelled
 
-    def _contrast(self, blur_px: float) -> NDArray[np.float32]:
+    def _contrast(self, blur_px: float) -> Levels:
         sigma_px = max(blur_px, _CONTRAST_BLUR_PX)
         if sigma_px not in self._contrasts:
             size = np.hypot(*gradient(blur_image(self._levelled, sigma_px)))
-            self._contrasts[sigma_px] = _level_contrast(np.asarray(size, np.float32), 2.0 * self._sigma_px)
+            self._contrasts[sigma_px] = _level_contrast(size, 2.0 * self._sigma_px)
         return self._contrasts[sigma_px]
 
-    def _fit(
-        self, reading: Callable[[float], NDArray[np.float32]], start: Calibration, stages: Stages = _STAGES
-    ) -> WallFit:
+    def _fit(self, reading: Callable[[float], Levels], start: Calibration, stages: Stages = _STAGES) -> WallFit:
         now = start
         for blur_px, most, enough_px in stages:
-            image = reading(blur_px)
-            sample = self._sample(image, now, most)
+            sample = self._sample(reading(blur_px), now, most)
             model = None
             for _ in range(_STEPS):
                 model = _Model(sample, self._walls, now, self._reach_um, model)
@@ -192,7 +151,7 @@ class Fitter:
                     break
         return self._judge(_Model(sample, self._walls, now, self._reach_um, model), now, sample)
 
-    def _sample(self, image: NDArray[np.float32], start: Calibration, most: int) -> _Sample:
+    def _sample(self, image: Levels, start: Calibration, most: int) -> _Sample:
         """At most so many pixels of the image near the walls, for a pose that moves a little yet."""
         to_um = start.matrix @ np.vstack(
             (np.column_stack((np.diag(self._step), 0.5 * self._step - 0.5)), (0.0, 0.0, 1.0))
@@ -206,7 +165,7 @@ class Fitter:
     def _judge(self, model: _Model, now: Calibration, sample: _Sample) -> WallFit:
         found, residual_um, covariance = model.patches()
         # The shift of the image's centre rather than of the middle of the pixels.
-        right, down = (np.array(self._size_px) - 1) / 2 - sample.middle_px
+        right, down = self._middle_px - sample.middle_px
         per = 1.0 / sample.reach_px
         to_centre = np.array(
             [[1, 0, -down * per, right * per], [0, 1, right * per, down * per], [0, 0, per, 0], [0, 0, 0, per]]
@@ -216,11 +175,11 @@ class Fitter:
             std = np.sqrt(np.maximum(np.diag(to_centre @ covariance @ to_centre.T), 0.0))
         std *= (now.um_per_px, now.um_per_px, math.degrees(1.0), 1.0)
         at_px = now.to_px(self._walls.points_um)
-        seen = float(((at_px >= 0) & (at_px <= np.array(self._size_px) - 1)).all(-1).mean())
+        seen = float(((at_px >= 0) & (at_px <= self._size_px - 1)).all(-1).mean())
         return WallFit(now, model.explained, found, seen, residual_um, std, np.zeros(4))
 
 
-def _level_contrast(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+def _level_contrast(image: Levels, sigma_px: float) -> Levels:
     """An image without its slow variation, of even contrast."""
     high = image - cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT)
     power = cv2.GaussianBlur(high * high, (0, 0), 2.0 * sigma_px, borderType=cv2.BORDER_REFLECT)
@@ -230,7 +189,7 @@ def _level_contrast(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.f
 class _Sample:
     """Pixels (n, 2) and their grey levels (n,); the point about which poses turn, and the mean distance from it."""
 
-    def __init__(self, at_px: Points, levels: NDArray[np.float64]) -> None:
+    def __init__(self, at_px: Floats, levels: Floats) -> None:
         self.at_px, self.levels = at_px, levels
         self.middle_px = at_px.mean(0) if len(at_px) else np.zeros(2)
         self.reach_px = max(float(np.hypot(*(at_px - self.middle_px).T).mean()), 1.0) if len(at_px) else 1.0
@@ -267,9 +226,9 @@ class _Model:
         turn = slope_px[:, 1] * arm[:, 0] - slope_px[:, 0] * arm[:, 1]
         # (n, 4) derivatives of d by right, down, turn, growth
         self._of_d = -np.column_stack((slope_px, turn, (slope_px * arm).sum(-1)))
-        self.offset: NDArray[np.float64] = before.offset if before is not None else np.zeros(self._count)
-        self.gain: NDArray[np.float64] = before.gain if before is not None else np.ones(self._count)
-        self._weight = np.ones(len(self._levels))
+        self.offset: Floats = before.offset if before is not None else np.zeros(self._count)
+        self.gain: Floats = before.gain if before is not None else np.ones(self._count)
+        self._weigh(np.ones(len(self._levels)))
         for _ in range(5 if before is None else 3):
             self._improve()
 
@@ -278,138 +237,138 @@ class _Model:
         a, b = self.offset[self._patch], self.gain[self._patch]
         self._profile = self._solve(self._weight * b, self._levels - a, b)
         f = self._at(self._profile)
-        self.offset, self.gain = self._light(f, self._levels)
-        self.gain = np.clip(self.gain, 0.2, 5.0)
-        self.offset = _mean(self._patch, self._weight, self._levels - self.gain[self._patch] * f, self._count)
-        self._rest = self._levels - self.offset[self._patch] - self.gain[self._patch] * f
+        self.gain = np.clip(self._gain(f), 0.2, 5.0)
+        b = self.gain[self._patch]
+        self.offset = self._mean(self._levels - b * f)
+        self._rest = self._levels - self.offset[self._patch] - b * f
         scale = 1.4826 * float(np.median(np.abs(self._rest))) + 1e-9 if len(self._rest) else 1.0
-        self._weight = np.maximum(1.0 - (self._rest / (_TUKEY * scale)) ** 2, 0.0) ** 2
+        self._weigh(np.maximum(1.0 - (self._rest / (_TUKEY * scale)) ** 2, 0.0) ** 2)
 
-    def _solve(
-        self, weight: NDArray[np.float64], values: NDArray[np.float64], gain: NDArray[np.float64] | float = 1.0
-    ) -> NDArray[np.float64]:
+    def _weigh(self, weight: Floats) -> None:
+        self._weight = weight
+        self._total = self._sums(weight) + 1e-9
+
+    def _gain(self, f: Floats) -> Floats:
+        """(patches,) slope of the line through the grey levels of each patch over f, drawn towards 1."""
+        df, dv = (values - self._mean(values)[self._patch] for values in (f, self._levels))
+        square, cross = (self._sums(self._weight * df * each) for each in (df, dv))
+        draw = 0.1 * float(square.sum()) / max(int(np.count_nonzero(square)), 1) + 1e-12
+        return (cross + draw) / (square + draw)
+
+    def _solve(self, weight: Floats, values: Floats, gain: Floats) -> Floats:
         """The g at the knots that minimises sum weight / gain (values - gain g(d))^2, with a little smoothness."""
-        return np.asarray(np.linalg.solve(self._normal(weight * gain), self._on_knots(weight * values)))
+        return np.asarray(np.linalg.solve(self._normal(weight * gain), self._on_knots(weight * values)), np.float64)
 
-    def _normal(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _normal(self, weight: Floats) -> Floats:
         """(knots, knots) matrix of the normal equations for g at the knots, with a little smoothness."""
         upper = weight * self._part
         both = upper * self._part
         # (1 - part)^2, part^2 and part (1 - part) from the sums of 1, part and part^2 between two knots.
-        one, first, second = (
-            np.asarray(np.bincount(self._low, each, _ALL_KNOTS), np.float64) for each in (weight, upper, both)
-        )
+        one, first, second = (_sums(self._low, each, _ALL_KNOTS) for each in (weight, upper, both))
         diagonal = one - 2.0 * first + second
         diagonal[1:] += second[:-1]
         beside = (first - second)[:-1]
-        matrix: NDArray[np.float64] = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
         matrix += 1e-4 * max(float(diagonal.mean()), 1e-9) * _BEND
         return matrix + 1e-9 * np.eye(_ALL_KNOTS)
 
-    def _on_knots(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _on_knots(self, values: Floats) -> Floats:
         """(knots,) sums of values (n,), of which each knot gets its share."""
-        upper = np.bincount(self._low, self._part * values, _ALL_KNOTS)
-        found = np.bincount(self._low, values, _ALL_KNOTS) - upper
+        upper = _sums(self._low, self._part * values, _ALL_KNOTS)
+        found = _sums(self._low, values, _ALL_KNOTS) - upper
         found[1:] += upper[:-1]
-        return np.asarray(found, np.float64)
+        return found
 
-    def _at(self, profile: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _at(self, profile: Floats) -> Floats:
         return profile.take(self._low) + self._part * np.diff(profile).take(self._low)
 
-    def _light(
-        self, f: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Offset a and gain b (patches,) of the line a + b f through each patch, drawn towards (mean, 1)."""
-        w, patch, count = self._weight, self._patch, self._count
-        mean_f, mean_v = _mean(patch, w, f, count), _mean(patch, w, values, count)
-        df, dv = f - mean_f[patch], values - mean_v[patch]
-        square, cross = np.bincount(patch, w * df * df, count), np.bincount(patch, w * df * dv, count)
-        draw = 0.1 * float(square.sum()) / max(int(np.count_nonzero(square)), 1) + 1e-12
-        b = (cross + draw) / (square + draw)
-        return mean_v - b * mean_f, b
+    def _sums(self, values: Floats) -> Floats:
+        """(patches,) sums of values (n,) over the patches."""
+        return _sums(self._patch, values, self._count)
+
+    def _mean(self, values: Floats) -> Floats:
+        """Weighted mean (patches,) of the values of each patch."""
+        return self._sums(self._weight * values) / self._total
 
     @property
     def explained(self) -> float:
         """Relative weighted variance within the patches that f explains."""
         if not len(self._levels):
             return 0.0
-        off = self._levels - _mean(self._patch, self._weight, self._levels, self._count)[self._patch]
+        off = self._levels - self._mean(self._levels)[self._patch]
         whole = float(np.sum(self._weight * off**2))
         return max(1.0 - float(np.sum(self._weight * self._rest**2)) / max(whole, 1e-12), 0.0)
 
-    def _jacobian(self) -> NDArray[np.float64]:
-        """(n, 4) derivatives of b f(d) by the motion, without what other f, a and b could explain."""
+    def _of_motion(self) -> Floats:
+        """(n,) derivative of b f(d) by d."""
         slope = np.gradient(self._profile) * _KNOTS / self._reach_um
+        of_d: Floats = self.gain[self._patch] * self._at(slope)
+        return of_d
+
+    def _jacobian(self) -> tuple[Floats, Floats]:
+        """(n, 4) derivatives of b f(d) by the motion, without what other f, a and b could explain; normal matrix."""
         gain = self.gain[self._patch]
-        jacobian: NDArray[np.float64] = (gain * self._at(slope))[:, None] * self._of_d
+        jacobian = self._of_motion()[:, None] * self._of_d
         weighted = self._weight * gain
         inverse = np.linalg.inv(self._normal(weighted * gain))
-        total = np.bincount(self._patch, self._weight, self._count) + 1e-9
         for column in range(4):
             values = jacobian[:, column]
             for _ in range(2):
                 values = values - gain * self._at(inverse @ self._on_knots(weighted * values))
-                mean = np.bincount(self._patch, self._weight * values, self._count) / total
-                values = values - mean[self._patch]
+                values = values - self._mean(values)[self._patch]
             jacobian[:, column] = values
-        return jacobian
+        return jacobian, jacobian.T @ (self._weight[:, None] * jacobian)
 
-    def step(self) -> NDArray[np.float64]:
+    def step(self) -> Floats:
         """The motion (4,) px that Gauss-Newton makes, at most two pixels of each kind."""
         if len(self._levels) < _LEAST_ALL:
             return np.zeros(4)
-        jacobian = self._jacobian()
-        normal = jacobian.T @ (self._weight[:, None] * jacobian)
+        jacobian, normal = self._jacobian()
         right = jacobian.T @ (self._weight * self._rest)
         normal += 1e-6 * np.trace(normal) * np.eye(4) + 1e-12 * np.eye(4)
         return np.clip(np.linalg.solve(normal, right), -2.0, 2.0)
 
-    def _other_profiles(self) -> NDArray[np.float64]:
+    def _other_profiles(self) -> Floats:
         """(4, knots) f of the walls whose channel lies to the left, above, to the right and below."""
         gain, levels = self.gain[self._patch], self._levels - self.offset[self._patch]
         ways = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
         return np.stack([self._solve(gain * (self._across @ way < 0.0), levels, gain) for way in ways])
 
-    def patches(self) -> tuple[float, float, NDArray[np.float64]]:
+    def patches(self) -> tuple[float, float, Floats]:
         """The part of the walls that is found, the residual in um, and the covariance (4, 4) of the motion in px^2."""
         if len(self._levels) < _LEAST_ALL:
             return 0.0, math.inf, np.full((4, 4), math.inf)
-        patch, count = self._patch, self._count
         # The walls of a patch that face one of four ways, and how their mean profile correlates with f of the others.
         way = np.rint(np.arctan2(self._across[:, 1], self._across[:, 0]) / (0.5 * math.pi)).astype(np.intp) % 4
-        wall, walls = 4 * patch + way, 4 * count
+        wall, walls = 4 * self._patch + way, 4 * self._count
         nearest = np.clip(np.rint(self._low + self._part).astype(np.intp), 0, _ALL_KNOTS - 1)
         key = wall * _ALL_KNOTS + nearest
-        shape = (walls, _ALL_KNOTS)
-        number = np.bincount(key, minlength=walls * _ALL_KNOTS).reshape(shape)
-        total = np.bincount(key, self._levels, walls * _ALL_KNOTS).reshape(shape)
-        like = _correlation(total / np.maximum(number, 1), np.tile(self._other_profiles(), (count, 1)), number)
+        number, total = (
+            np.bincount(key, values, walls * _ALL_KNOTS).reshape(walls, _ALL_KNOTS) for values in (None, self._levels)
+        )
+        like = _correlation(total / np.maximum(number, 1), np.tile(self._other_profiles(), (self._count, 1)), number)
         usable = (np.bincount(wall, minlength=walls) >= _LEAST_PIXELS) & ((number > 0).sum(1) >= _KNOTS // 2)
         length = np.bincount(wall, np.abs(self._distance) < 0.25 * self._reach_um, walls)
         found = usable & (like > _LIKE)
         share = float(length[found].sum() / max(length[usable].sum(), 1e-9))
-        slope = np.gradient(self._profile) * _KNOTS / self._reach_um
-        of_d = self.gain[patch] * self._at(slope)
-        square = np.bincount(wall, of_d * self._weight * of_d, walls)
-        off_um = np.bincount(wall, of_d * self._weight * self._rest, walls) / np.maximum(square, 1e-12)
+        of_d = self._of_motion()
+        square, moved = (_sums(wall, of_d * self._weight * each, walls) for each in (of_d, self._rest))
+        off_um = moved / np.maximum(square, 1e-12)
         weights = length * found
         residual = math.sqrt(float(np.sum(weights * off_um**2) / max(weights.sum(), 1e-9)))
-        jacobian = self._jacobian()
-        normal = jacobian.T @ (self._weight[:, None] * jacobian)
-        parts = np.stack([np.bincount(patch, self._weight * self._rest * jacobian[:, k], count) for k in range(4)], -1)
+        jacobian, normal = self._jacobian()
+        parts = np.stack([self._sums(self._weight * self._rest * jacobian[:, k]) for k in range(4)], -1)
         values, vectors = np.linalg.eigh(normal)
         inverse = vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * values[-1])) @ vectors.T
         return share, residual, inverse @ (parts.T @ parts) @ inverse
 
 
-def _mean(
-    patch: NDArray[np.intp], weight: NDArray[np.float64], values: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
-    """Weighted mean (count,) of the values of each patch."""
-    return np.asarray(np.bincount(patch, weight * values, count) / (np.bincount(patch, weight, count) + 1e-9))
+def _sums(places: Indices, values: Floats, count: int) -> Floats:
+    """(count,) sums of the values (n,) at each place."""
+    return np.asarray(np.bincount(places, values, count), np.float64)
 
 
-def _correlation(a: NDArray[np.float64], b: NDArray[np.float64], weight: NDArray[np.int64]) -> NDArray[np.float64]:
+def _correlation(a: Floats, b: Floats, weight: Indices) -> Floats:
     """Weighted correlation of the rows of a and b."""
     total = np.maximum(weight.sum(1, keepdims=True), 1)
     a = a - (weight * a).sum(1, keepdims=True) / total

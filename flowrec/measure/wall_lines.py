@@ -14,23 +14,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.measure.wall_search import blur_image
+from flowrec.measure.images import Floats, Levels, Mask, blur_image, slopes
 
-Floats = NDArray[np.float32]
 _SIGMAS_PX = ((1.2, 2.0), (2.0, 3.5), (3.5, 5.5))  # of lines; each row is a hypothesis
 _THRESHOLDS = (0.55, 0.9)  # of a wall, relative to Otsu's threshold between strong and weak ridges
 _SMOOTH_PX = 1.5
 _REACH_PX = 12.0  # within which the ends of walls attract the border of a basin
 
 
-def divisions(image: Floats) -> Iterator[tuple[NDArray[np.bool_], float]]:
+def divisions(image: Levels) -> Iterator[tuple[Mask, float]]:
     """Hypotheses: parts (h, w) of two kinds between bright lines, and the share of what looks like a wall that divides.
 
     The share is weighted by the square of the walls' lengths: long walls are walls, noise has short ones.
     """
     for sigmas_px in _SIGMAS_PX:
         ridge = _ridges(image, sigmas_px)
-        crest = (ridge >= np.asarray(cv2.dilate(ridge, np.ones((5, 5), np.uint8)))) & (ridge > 0)
+        crest = (ridge >= cv2.dilate(ridge, np.ones((5, 5), np.uint8))) & (ridge > 0)
         values = ridge[crest].astype(np.float64)
         if len(values) < 16:
             continue
@@ -38,17 +37,17 @@ def divisions(image: Floats) -> Iterator[tuple[NDArray[np.bool_], float]]:
         if usual <= 0:
             continue
         for threshold in _THRESHOLDS:
-            strength = np.asarray(ridge / np.float32(threshold * usual), np.float32)
+            strength = ridge / np.float32(threshold * usual)
             basins, count = _basins(strength)
             if count < 2:
                 continue
             kinds, agreed = _two_kinds(basins, count, strength)
             parts = blur_image(kinds[basins].astype(np.float32), _SMOOTH_PX) > 0.5
             if parts.any() and not parts.all():
-                yield np.asarray(parts), agreed
+                yield parts, agreed
 
 
-def otsu(values: NDArray[np.float64]) -> float:
+def otsu(values: Floats) -> float:
     """The threshold of most variance between two classes of values. Source: Otsu (1979)."""
     low, high = np.percentile(values, (0.5, 99.5))
     counts, edges = np.histogram(values, 256, (low, max(high, low + 1e-6)))
@@ -59,26 +58,22 @@ def otsu(values: NDArray[np.float64]) -> float:
     return float(middles[int(np.argmax(below * above * (mean_low - mean_high) ** 2))])
 
 
-def _ridges(image: Floats, sigmas_px: tuple[float, ...]) -> Floats:
+def _ridges(image: Levels, sigmas_px: tuple[float, ...]) -> Levels:
     """Strength (h, w) of bright lines of several widths."""
     best = np.zeros(image.shape, np.float32)
     for sigma in sigmas_px:
-        smooth = blur_image(image, sigma)
-        xx, yy, xy = (
-            np.asarray(cv2.Sobel(smooth, cv2.CV_32F, *k, ksize=3, scale=0.25, borderType=cv2.BORDER_REPLICATE))
-            for k in ((2, 0), (0, 2), (1, 1))
-        )
+        xx, yy, xy = slopes(blur_image(image, sigma), (2, 0), (0, 2), (1, 1), scale=0.25)
         half, root = 0.5 * (xx + yy), np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
         across, along = root - half, -half - root
         best = np.maximum(best, np.maximum(sigma**1.5 * (across - np.abs(along)), 0.0))
-    return np.asarray(best, np.float32)
+    return best
 
 
-def _basins(strength: Floats) -> tuple[NDArray[np.int32], int]:
+def _basins(strength: Levels) -> tuple[NDArray[np.int32], int]:
     """The basins (h, w), from 0, that water drains into between walls, and their number; the ends of a gap attract."""
-    away = np.asarray(cv2.distanceTransform((strength < 1.0).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+    away = cv2.distanceTransform((strength < 1.0).astype(np.uint8), cv2.DIST_L2, 5)
     ground = np.clip(strength, 0.0, 2.5) - np.minimum(away, _REACH_PX) / np.float32(_REACH_PX) - 0.01 * away
-    ground = blur_image(np.asarray(ground, np.float32), 1.0)
+    ground = blur_image(ground, 1.0)
     height, width = ground.shape
     around = np.pad(ground, 1, constant_values=np.inf)
     index = np.pad(np.arange(height * width, dtype=np.int64).reshape(height, width), 1, constant_values=-1)
@@ -101,28 +96,26 @@ def _basins(strength: Floats) -> tuple[NDArray[np.int32], int]:
     return number[to].reshape(height, width), len(roots)
 
 
-def _two_kinds(basins: NDArray[np.int32], count: int, strength: Floats) -> tuple[NDArray[np.bool_], float]:
+def _two_kinds(basins: NDArray[np.int32], count: int, strength: Levels) -> tuple[Mask, float]:
     """The kind (count,) of each basin, and which share of the walls it agrees with.
 
     Greedy maximum cut: borders of most weight are decided first, by a union of sets with parity; the weights of joined
     basins add up.
     """
-    around: list[dict[int, float]] = [{} for _ in range(count)]
     pairs, weights = [], []
-    for a, b, s, t in (
-        (basins[:, 1:], basins[:, :-1], strength[:, 1:], strength[:, :-1]),
-        (basins[1:], basins[:-1], strength[1:], strength[:-1]),
-    ):
-        differ = a != b
-        one, other = a[differ].astype(np.int64), b[differ].astype(np.int64)
-        pairs.append(np.minimum(one, other) * count + np.maximum(one, other))
-        weights.append(np.clip(np.maximum(s[differ], t[differ]), 0.0, 2.0) - 1.0)
+    for after, before in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        one, other = basins[after].astype(np.int64), basins[before].astype(np.int64)
+        differ = one != other
+        pairs.append((np.minimum(one, other) * count + np.maximum(one, other))[differ])
+        weights.append(np.clip(np.maximum(strength[after], strength[before])[differ], 0.0, 2.0) - 1.0)
     codes, each = np.unique(np.concatenate(pairs), return_inverse=True)
     ends = np.column_stack(np.divmod(codes, count))
     worth = np.bincount(each.ravel(), np.concatenate(weights), len(ends))
+    around: list[dict[int, float]] = [{} for _ in range(count)]
+    heap: list[tuple[float, int, int]] = []
     for (a, b), value in zip(ends.tolist(), worth.tolist(), strict=True):
         around[a][b] = around[b][a] = value
-    heap = [(-abs(value), a, b) for (a, b), value in zip(ends.tolist(), worth.tolist(), strict=True)]
+        heap.append((-abs(value), a, b))
     heapq.heapify(heap)
     members = [[k] for k in range(count)]
     kind = np.zeros(count, np.bool_)
@@ -133,17 +126,16 @@ def _two_kinds(basins: NDArray[np.int32], count: int, strength: Floats) -> tuple
             continue  # joined, or another weight by now
         if len(members[a]) < len(members[b]):
             a, b = b, a
-        turn = (value > 0) == bool(kind[members[a][0]] == kind[members[b][0]])
-        if turn:
+        if (value > 0) == bool(kind[members[a][0]] == kind[members[b][0]]):
             kind[members[b]] = ~kind[members[b]]
         # The sets' own weights are stated between their first members.
         sign = -1.0 if value > 0 else 1.0
         del around[a][b], around[b][a]
-        for other, more in around[b].items():
-            del around[other][b]
-            total = around[a].get(other, 0.0) + sign * more
-            around[a][other] = around[other][a] = total
-            heapq.heappush(heap, (-abs(total), min(a, other), max(a, other)))
+        for c, more in around[b].items():
+            del around[c][b]
+            total = around[a].get(c, 0.0) + sign * more
+            around[a][c] = around[c][a] = total
+            heapq.heappush(heap, (-abs(total), min(a, c), max(a, c)))
         around[b] = {}
         members[a] += members[b]
     cut = kind[ends[:, 0]] != kind[ends[:, 1]]

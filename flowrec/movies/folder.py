@@ -13,7 +13,7 @@ from PIL import UnidentifiedImageError
 
 from flowrec.core import Image, MovieError
 from flowrec.movies.grey import grey_image
-from flowrec.movies.movie import MOST_PIXELS, Movie, MovieFacts, ReadOptions, checked_size, depth_of
+from flowrec.movies.movie import MOST_PIXELS, Movie, MovieFacts, checked_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 _DIGITS = re.compile(r"(\d+)")
@@ -23,36 +23,32 @@ _LOSSY = ("JPEG", "MPO")
 class FolderMovie(Movie):
     """Images of one size and kind. Headers are read by Pillow before OpenCV decodes anything."""
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
-        super().__init__(path, options)
+    def _open(self) -> MovieFacts:
+        path = self.path
         self._files = [path] if path.is_file() else images_in(path)
         if not self._files:
             kinds = ", ".join(suffix.lstrip(".") for suffix in SUFFIXES)
             raise MovieError(f"{path}: no image is in this folder; images are {kinds}")
-        first = self._header(self._files[0])
-        array = _decode(self._files[0])
-        significant = 16 if array.dtype == np.uint16 else 8
-        remarks = []
-        if significant == 16 and options.bits is None:
-            remarks.append("images do not say how many of their 16 bits the camera used; 16 are assumed (movie.bits)")
+        width, height, kind = _header(self._files[0])
+        kept = 16 if _decode(self._files[0]).dtype == np.uint16 else 8
+        bits = self._depth(kept, who="images do not say how many of their")
         left = sum(1 for each in path.iterdir() if each.is_file()) - len(self._files) if path.is_dir() else 0
         if left:
-            remarks.append(f"{left} other files in the folder are no images by their names")
-        self.facts = MovieFacts(
+            self._assumed.append(f"{left} other files in the folder are no images by their names")
+        return MovieFacts(
             reader="folder",
             library=f"OpenCV {cv2.__version__}",
-            codec=first[2].lower(),
-            lossy=first[2] in _LOSSY,
-            width_px=first[0],
-            height_px=first[1],
-            bits=depth_of(significant, options.bits),
+            codec=kind.lower(),
+            lossy=kind in _LOSSY,
+            width_px=width,
+            height_px=height,
+            bits=bits,
             frames=len(self._files),
-            remarks=tuple(remarks),
         )
 
     def image(self, index: int) -> Image:
         file, facts = self._files[index], self.facts
-        width, height, _ = self._header(file)
+        width, height, _ = _header(file)
         if (width, height) != (facts.width_px, facts.height_px):
             raise MovieError(
                 f"{file}: has {width} x {height} pixels, {self._files[0].name} {facts.width_px} x {facts.height_px}; "
@@ -70,28 +66,21 @@ class FolderMovie(Movie):
             ) from error
         super().broken_off(read, why, error)
 
-    def _header(self, file: Path) -> tuple[int, int, str]:
-        """Width, height and format, from the first bytes."""
-        try:
-            with (
-                warnings.catch_warnings(action="ignore", category=Header.DecompressionBombWarning),
-                file.open("rb") as f,
-            ):
-                header = Header.open(f)
-                if getattr(header, "n_frames", 1) > 1:
-                    raise MovieError(
-                        f"{file}: holds several images; a stack is imported by its own name, not as a folder"
-                    )
-                width, height = checked_size(file, *header.size)
-                return width, height, header.format or ""
-        except Header.DecompressionBombError as error:
-            raise MovieError(
-                f"{file}: more than {MOST_PIXELS / 1e6:g} million pixels; crop or bin the images"
-            ) from error
-        except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-            raise MovieError(
-                f"{file}: is no image that can be read; it is damaged, or another file by that name"
-            ) from error
+
+def _header(file: Path) -> tuple[int, int, str]:
+    """Width, height and format, from the first bytes."""
+    try:
+        with warnings.catch_warnings(action="ignore", category=Header.DecompressionBombWarning), file.open("rb") as f:
+            header = Header.open(f)
+            if getattr(header, "n_frames", 1) > 1:
+                raise MovieError(f"{file}: holds several images; a stack is imported by its own name, not as a folder")
+            return *checked_size(file, *header.size), header.format or ""
+    except Header.DecompressionBombError as error:
+        raise MovieError(f"{file}: more than {MOST_PIXELS / 1e6:g} million pixels; crop or bin the images") from error
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise MovieError(
+            f"{file}: is no image that can be read; it is damaged, or another file by that name"
+        ) from error
 
 
 def images_in(folder: Path) -> list[Path]:

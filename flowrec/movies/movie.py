@@ -6,15 +6,17 @@ Nothing is converted silently: grey levels are those of the file, and what had t
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import NS_PER_S, PIXEL_BITS, Image, Method, Methods, MovieError, pixel_type
+from flowrec.movies.grey import grey_image
 from flowrec.movies.notes import MovieNotes
 
 # A row's class is made with (path, options) and is a Movie.
@@ -33,7 +35,6 @@ MOVIE_READERS = Methods(
 LARGEST_PX, SMALLEST_PX = 16_384, 8  # as of camera.width_px and height_px
 MOST_PIXELS = 150_000_000
 MOST_IMAGES = 20_000_000
-_ONLY = "only the first"
 _MEDIAN_BYTES = 400_000_000  # of the images that a median is taken of
 
 
@@ -91,7 +92,6 @@ class MovieFacts:
     times_ns: NDArray[np.int64] | None = None
     times: str = ""
     um_per_px: float | None = None
-    remarks: tuple[str, ...] = ()  # what was assumed, and what is unusual
     notes: MovieNotes | None = None
 
     def describe(self) -> str:
@@ -110,18 +110,32 @@ class Movie(ABC):
     ----------
     path : as given.
     facts : what the file tells.
-    remarks : those of `facts`, and what was noticed while reading.
     """
-
-    facts: MovieFacts
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         self.path = path
         self.options = options
-        self.remarks: list[str] = []
+        self._assumed: list[str] = []  # and what is unusual, in sentences
+        self._cut: list[str] = []  # sentence on an early end
+        self._opened = ExitStack()  # what is closed with the movie
+        try:
+            self.facts = self._open()
+        except BaseException:
+            self.close()
+            raise
 
-    def close(self) -> None:  # noqa: B027  most readers hold no file
+    def close(self) -> None:
         """Release the file."""
+        self._opened.close()
+
+    @property
+    def remarks(self) -> list[str]:
+        """Assumptions, what is unusual, and what was noticed while reading."""
+        return [*self._assumed, *self._cut]
+
+    @abstractmethod
+    def _open(self) -> MovieFacts:
+        """Open the file; MovieError if it is no movie that can be read."""
 
     @abstractmethod
     def image(self, index: int) -> Image:
@@ -148,14 +162,11 @@ class Movie(ABC):
         if not self.options.partial or not read:
             advice = f"; --partial takes the {read} images before it" if read else ""
             raise MovieError(f"{self.path}: {why}{advice}") from error
-        self.remarks = [each for each in self.remarks if not each.startswith(_ONLY)]
-        self.remarks.append(f"{_ONLY} {read} images were taken: {why}")
+        self._cut = [f"only the first {read} images were taken: {why}"]
 
     def median_image(self, count: int = 31) -> Image:
         """Median of at most `count` images spread over the movie: what does not move, such as the chip."""
-        images = np.stack([self.image(index) for index in self.median_indices(count)])
-        median: Image = np.median(images, axis=0, overwrite_input=True).round().astype(images.dtype)
-        return median
+        return median_of(self.image(index) for index in self.median_indices(count))
 
     def median_indices(self, count: int = 31) -> list[int]:
         """The images that `median_image` takes."""
@@ -170,6 +181,31 @@ class Movie(ABC):
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _grey(self, array: NDArray[Any], index: int) -> Image:
+        """Grey levels (h, w) of an image, see `grey_image`."""
+        return grey_image(array, self.options.channel, self.facts.bits, self.path, index)
+
+    def _depth(self, kept: int, stated: int | None = None, who: str = "the file does not say how many of its") -> int:
+        """The depth of PIXEL_BITS of pixels that are kept in so many bits; the one that was asked for, if any.
+
+        Parameters
+        ----------
+        stated : number of significant bits by the file.
+        """
+        if self.options.bits is not None:
+            return self.options.bits
+        bits = next(bits for bits in PIXEL_BITS if bits >= (stated or kept))
+        if bits == 16 and stated is None:
+            self._assumed.append(f"{who} 16 bits the camera used; 16 are assumed (movie.bits)")
+        return bits
+
+
+def median_of(images: Iterable[Image]) -> Image:
+    """Median of images of one size."""
+    stack = np.stack(list(images))
+    median: Image = np.median(stack, axis=0, overwrite_input=True).round().astype(stack.dtype)
+    return median
 
 
 def checked_size(path: Path, width_px: int, height_px: int) -> tuple[int, int]:
@@ -200,11 +236,35 @@ def refuse_missing(image: Image, path: Path, index: int) -> Image:
     return image
 
 
-def depth_of(significant: int, asked: int | None) -> int:
-    """The depth of PIXEL_BITS that holds so many significant bits; the one that was asked for, if any."""
-    return asked if asked is not None else next(bits for bits in PIXEL_BITS if bits >= significant)
+@contextmanager
+def refusing(what: str, after: str = "") -> Iterator[None]:
+    """Turn what a library raises, of many kinds, into a MovieError, with the reason between two texts."""
+    try:
+        yield
+    except MovieError:
+        raise
+    except Exception as error:
+        raise MovieError(f"{what} ({str(error) or type(error).__name__}){after}") from error
+
+
+def refuse_series(path: Path, lengths: Iterable[tuple[str, int]]) -> MovieError:
+    """The error for a file with more than one series of images, by the lengths of its axes."""
+    named = ", ".join(f"{axis} {length}" for axis, length in lengths)
+    return MovieError(f"{path}: has more than one series of images ({named}); export one channel and one plane")
+
+
+def colours_last(array: NDArray[Any], counts: tuple[int, ...]) -> NDArray[Any]:
+    """An image (h, w, colours) of one that may have its colours, of one of these counts, first."""
+    first = array.ndim == 3 and array.shape[0] in counts and array.shape[2] not in counts
+    return np.moveaxis(array, 0, 2) if first else array
 
 
 def whole_ns(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
     """Times in s as ns."""
     return np.rint(np.asarray(times_s, np.float64) * NS_PER_S).astype(np.int64)
+
+
+def nominal_times(count: int, interval_s: float, source: str) -> tuple[NDArray[np.int64], str]:
+    """Times of images at equal intervals, and where they come from."""
+    times_ns = whole_ns(np.arange(count, dtype=np.float64) * interval_s)
+    return times_ns, f"{source}, every {1e3 * interval_s:.4g} ms; nominal"

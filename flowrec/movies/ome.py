@@ -9,8 +9,11 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+# Units by their short names, with both letters for micro, and by their long ones.
 _S_PER = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+_S_PER |= {"second": 1.0, "millisecond": 1e-3, "microsecond": 1e-6, "nanosecond": 1e-9, "minute": 60.0, "hour": 3600.0}
 _UM_PER = {"µm": 1.0, "μm": 1.0, "um": 1.0, "micron": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
+_UM_PER |= {"micrometer": 1.0, "nanometer": 1e-3, "millimeter": 1e3, "centimeter": 1e4, "meter": 1e6}
 _LIMIT_CHARACTERS = 1 << 28
 NAMESPACE = "flowrec"  # of the annotation in which flowrec keeps movies/notes.py
 
@@ -25,10 +28,19 @@ class OmeFacts:
     bits: int | None = None
 
 
-def ome_facts(xml: str, frames: int) -> OmeFacts:
-    """Read the first image of an OME-XML text; what is damaged there counts as not stated."""
-    root = _root(xml)
-    pixels = None if root is None else next((each for each in root.iter() if _name(each) == "Pixels"), None)
+def parse_ome(xml: str) -> ElementTree.Element:
+    """The root of an OME-XML text; one without anything in it where the text is damaged."""
+    if len(xml) > _LIMIT_CHARACTERS:
+        return ElementTree.Element("")
+    try:
+        return ElementTree.fromstring(xml.encode())  # noqa: S314  expat bounds the expansion of entities
+    except ElementTree.ParseError:
+        return ElementTree.Element("")
+
+
+def ome_facts(root: ElementTree.Element, frames: int) -> OmeFacts:
+    """Read the first image of OME-XML; what is damaged there counts as not stated."""
+    pixels = root.find(".//{*}Pixels")
     if pixels is None:
         return OmeFacts()
     given = pixels.attrib
@@ -41,53 +53,35 @@ def ome_facts(xml: str, frames: int) -> OmeFacts:
     )
 
 
-def annotation_in(xml: str) -> str:
+def annotation_in(root: ElementTree.Element) -> str:
     """The text that flowrec put into OME-XML; '' if there is none."""
-    root = _root(xml)
-    for each in root.iter() if root is not None else ():
-        if _name(each) == "CommentAnnotation" and each.get("Namespace") == NAMESPACE:
-            return "".join(child.text or "" for child in each)
-    return ""
+    found = root.find(f".//{{*}}CommentAnnotation[@Namespace='{NAMESPACE}']")
+    return "" if found is None else "".join(child.text or "" for child in found)
 
 
-def declared_planes(xml: str) -> int:
-    """Number of planes that the images of an OME-XML text declare, whether they exist or not; at least 1."""
-    root = _root(xml)
-    if root is None:
-        return 1
+def declared_planes(root: ElementTree.Element) -> int:
+    """Number of planes that the images of OME-XML declare, whether they exist or not; at least 1."""
     total = 0
-    for pixels in root.iter():
-        if _name(pixels) == "Pixels":
-            sizes = [_number(pixels.get(f"Size{axis}")) or 1.0 for axis in "TZC"]
-            blocks = [_number(block.get("PlaneCount")) or 1.0 for block in pixels if _name(block) == "TiffData"]
-            total += int(min(max(math.prod(sizes), sum(blocks)), 1e15))
+    for pixels in root.iterfind(".//{*}Pixels"):
+        sizes = [_number(pixels.get(f"Size{axis}")) or 1.0 for axis in "TZC"]
+        blocks = [_number(block.get("PlaneCount")) or 1.0 for block in pixels.iterfind("{*}TiffData")]
+        total += int(min(max(math.prod(sizes), sum(blocks)), 1e15))
     return max(total, 1)
 
 
 def seconds_per(unit: str | None) -> float | None:
     """Length of a unit of time in s, by its short or long name; None: unknown."""
-    short = {"second": "s", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns", "minute": "min", "hour": "h"}
-    return _S_PER.get(short.get(unit or "", unit or ""))
+    return _S_PER.get(unit or "")
 
 
 def um_per(unit: str | None) -> float | None:
     """Length of a unit of length in um, by its short or long name; None: unknown."""
-    short = {"micrometer": "um", "nanometer": "nm", "millimeter": "mm", "centimeter": "cm", "meter": "m"}
-    return _UM_PER.get(short.get(unit or "", unit or ""))
-
-
-def _root(xml: str) -> ElementTree.Element | None:
-    if len(xml) > _LIMIT_CHARACTERS:
-        return None
-    try:
-        return ElementTree.fromstring(xml.encode())  # noqa: S314  expat bounds the expansion of entities
-    except ElementTree.ParseError:
-        return None
+    return _UM_PER.get(unit or "")
 
 
 def _times_s(pixels: ElementTree.Element, frames: int) -> NDArray[np.float64] | None:
     """DeltaT of the first plane of each time point; of the planes in order where they are numbered by Z."""
-    planes = [each for each in pixels if _name(each) == "Plane"]
+    planes = pixels.findall("{*}Plane")
     axis = "TheT" if len({each.get("TheT") for each in planes}) > 1 else "TheZ"
     found: dict[int, float] = {}
     for each in planes:
@@ -110,7 +104,3 @@ def _number(text: str | None) -> float | None:
     except ValueError:
         return None
     return number if np.isfinite(number) else None
-
-
-def _name(element: ElementTree.Element) -> str:
-    return element.tag.rpartition("}")[2]

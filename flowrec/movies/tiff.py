@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from contextlib import contextmanager
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
 from flowrec.core import Image, MovieError
-from flowrec.movies.grey import grey_image, refuse_other_type
-from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_count, checked_size, depth_of, whole_ns
+from flowrec.movies.grey import refuse_other_type
+from flowrec.movies.movie import (
+    Movie,
+    MovieFacts,
+    checked_count,
+    checked_size,
+    colours_last,
+    nominal_times,
+    refuse_series,
+    refusing,
+    whole_ns,
+)
 from flowrec.movies.notes import notes_in, refuse_drawn
-from flowrec.movies.ome import OmeFacts, annotation_in, declared_planes, ome_facts, um_per
+from flowrec.movies.ome import OmeFacts, annotation_in, declared_planes, ome_facts, parse_ome, um_per
 
 _LOSSY = ("JPEG", "JPEG_LOSSY", "OJPEG", "WEBP", "JPEGXR", "JPEGXL", "JPEG2000", "JETRAW")
 _MINISWHITE, _PALETTE = 0, 3
@@ -25,38 +35,25 @@ _MINISWHITE, _PALETTE = 0, 3
 class TiffMovie(Movie):
     """A stack of images. One page is decoded at a time."""
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
-        super().__init__(path, options)
-        with ExitStack() as refused:
-            try:
-                with _collect_errors() as complaints:
-                    self._file = refused.enter_context(tifffile.TiffFile(path))
-                    if self._file.is_ome:  # before tifffile makes a list of all that the text declares
-                        checked_count(path, declared_planes(self._file.ome_metadata or ""))
-                    self._pages = self._pages_of(self._file)
-                    self.facts = self._facts()
-                if complaints:
-                    found = len(self._pages)
-                    self.broken_off(found, f"is damaged or breaks off, {found} images are there ({complaints[0]})")
-            except MovieError:
-                raise
-            except Exception as error:  # of many kinds
-                raise self._unreadable(error) from error
-            refused.pop_all()
-
-    def _unreadable(self, error: Exception) -> MovieError:
-        why = str(error) or type(error).__name__
-        return MovieError(f"{self.path}: is no TIFF that can be read ({why}); the file is damaged or cut short")
-
-    def close(self) -> None:
-        self._file.close()
+    def _open(self) -> MovieFacts:
+        unreadable = refusing(f"{self.path}: is no TIFF that can be read", "; the file is damaged or cut short")
+        with unreadable, _collect_errors() as complaints:
+            self._file = self._opened.enter_context(tifffile.TiffFile(self.path))
+            ome = parse_ome(self._file.ome_metadata or "" if self._file.is_ome else "")
+            checked_count(self.path, declared_planes(ome))  # before tifffile makes a list of all that the text declares
+            self._pages = self._pages_of(self._file)
+            facts = self._facts(ome)
+        if complaints:
+            found = len(self._pages)
+            self.broken_off(found, f"is damaged or breaks off, {found} images are there ({complaints[0]})")
+        return facts
 
     def _pages_of(self, file: tifffile.TiffFile) -> list[Any]:
         """The pages of the movie in order; of those that are not there, None. Or frames of contiguous pixels."""
         series = file.series
         if not series:
             raise MovieError(f"{self.path}: holds no image")
-        if len({each.shape for each in series}) > 1 or len(series) > 1:
+        if len(series) > 1:
             sizes = list(
                 dict.fromkeys(f"{each.sizes.get('width', 0)} x {each.sizes.get('height', 0)}" for each in series)
             )
@@ -69,10 +66,7 @@ class TiffMovie(Movie):
             axis: length for axis, length in zip(axes, first.shape, strict=False) if length > 1 and axis not in "YX"
         }
         if len(long) > 1:
-            named = ", ".join(f"{axis} {length}" for axis, length in long.items())
-            raise MovieError(
-                f"{self.path}: has more than one series of images ({named}); export one channel and one plane"
-            )
+            raise refuse_series(self.path, long.items())
         return self._whole_pages(first, next(iter(long.values()), 1))
 
     def _whole_pages(self, series: Any, count: int) -> list[Any]:
@@ -80,36 +74,34 @@ class TiffMovie(Movie):
         if len(pages) == 1 < count and series.dataoffset is not None:  # ImageJ: one page, then nothing but pixels
             shape, dtype = (count, *series.keyframe.shape), series.keyframe.dtype.newbyteorder(self._file.byteorder)
             there = (self.path.stat().st_size - series.dataoffset) // (series.keyframe.size * dtype.itemsize)
-            if there < count:
-                self.broken_off(there, f"breaks off: its header promises {count} images, {there} are there")
+            self._check_whole(there, count)
             return list(np.memmap(self.path, dtype, "r", series.dataoffset, (min(there, count), *shape[1:])))
         there = next((n for n, page in enumerate(pages) if page is None), len(pages))
-        if there < count:
-            self.broken_off(there, f"breaks off: its header promises {count} images, {there} are there")
+        self._check_whole(there, count)
         return pages[: min(there, count)]
 
-    def _facts(self) -> MovieFacts:
+    def _check_whole(self, there: int, count: int) -> None:
+        if there < count:
+            self.broken_off(there, f"breaks off: its header promises {count} images, {there} are there")
+
+    def _facts(self, xml: Element) -> MovieFacts:
         file, page, count = self._file, self._file.series[0].keyframe, len(self._pages)
         refuse_other_type(self.path, page.dtype)
-        remarks = []
-        notes = notes_in(annotation_in(file.ome_metadata or ""), self.path) if file.is_ome else None
+        notes = notes_in(annotation_in(xml), self.path)
         refuse_drawn(notes, self.path)
-        ome = ome_facts(file.ome_metadata or "", count) if file.is_ome else OmeFacts()
+        ome = ome_facts(xml, count)
         imagej: dict[str, Any] = dict(file.imagej_metadata or {})
         micromanager: dict[str, Any] = dict(file.micromanager_metadata or {}) if file.is_micromanager else {}
         stated = ome.bits or _whole(micromanager.get("Summary", {}).get("BitDepth"))
-        bits = depth_of(
-            stated or page.dtype.itemsize * 8 if page.bitspersample == 16 else page.bitspersample, self.options.bits
-        )
-        if bits == 16 and stated is None and self.options.bits is None:
-            remarks.append("the file does not say how many of its 16 bits the camera used; 16 are assumed (movie.bits)")
+        kept = page.bitspersample
+        bits = self._depth(kept, stated) if kept == 16 else self._depth(kept)
         if int(page.photometric) == _PALETTE:
             raise MovieError(f"{self.path}: its pixels are numbers of colours (a palette); export grey levels")
         if int(page.photometric) == _MINISWHITE:
-            remarks.append("it declares 0 as white; grey levels are used as they are stored")
+            self._assumed.append("it declares 0 as white; grey levels are used as they are stored")
         axis = file.series[0].axes[:1]
         if axis == "Z" and count > 1:
-            remarks.append("its images are numbered as planes of depth (Z); they are taken as a movie")
+            self._assumed.append("its images are numbered as planes of depth (Z); they are taken as a movie")
         times, text = _times(ome, imagej, count)
         compression = page.compression.name if hasattr(page.compression, "name") else str(page.compression)
         return MovieFacts(
@@ -124,19 +116,14 @@ class TiffMovie(Movie):
             times_ns=times,
             times=text,
             um_per_px=ome.um_per_px if ome.um_per_px is not None else _imagej_um_per_px(page, imagej),
-            remarks=tuple(remarks),
             notes=notes,
         )
 
     def image(self, index: int) -> Image:
         page = self._pages[index]
-        try:
+        with refusing(f"{self.path}: image {index} can not be decoded"):
             array = np.asarray(page) if isinstance(page, np.ndarray) else _decode(page)
-        except Exception as error:  # of many kinds, by the codec
-            raise MovieError(f"{self.path}: image {index} can not be decoded ({error})") from error
-        if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[2] not in (3, 4):  # one plane per colour
-            array = np.moveaxis(array, 0, 2)
-        return grey_image(array, self.options.channel, self.facts.bits, self.path, index)
+        return self._grey(colours_last(array, (3, 4)), index)
 
 
 def _decode(page: Any) -> NDArray[Any]:
@@ -174,9 +161,7 @@ def _times(ome: OmeFacts, imagej: dict[str, Any], count: int) -> tuple[NDArray[n
         interval_s, text = imagej.get("finterval"), "the interval that ImageJ states"
     if not isinstance(interval_s, (int, float)) or not interval_s > 0.0:
         return None, ""
-    return whole_ns(
-        np.arange(count, dtype=np.float64) * float(interval_s)
-    ), f"{text}, every {1e3 * interval_s:.4g} ms; nominal"
+    return nominal_times(count, float(interval_s), text)
 
 
 def _imagej_um_per_px(page: Any, imagej: dict[str, Any]) -> float | None:

@@ -6,8 +6,8 @@ damage that decodes is not noticed: of single bytes flipped in H.264, XviD and M
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import NS_PER_S, Image, MovieError, pixel_type
-from flowrec.movies.grey import CHANNELS, grey_image, refuse_colour
-from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, ReadOptions, checked_size, depth_of
+from flowrec.movies.grey import CHANNELS, refuse_colour
+from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, checked_size
 from flowrec.movies.notes import notes_in, refuse_drawn
 
 _LOSSLESS = {
@@ -65,20 +65,9 @@ _HIGH_BITS = ("p010", "p012", "p210")  # samples are in the upper bits of 16
 class VideoMovie(Movie):
     """A movie in a container. Packets are listed when it is opened; images are decoded when they are asked for."""
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
-        super().__init__(path, options)
-        self._container, self._stream = _open_stream(path)
-        try:
-            self.facts = self._facts()
-        except BaseException:
-            self._container.close()
-            raise
-
-    def close(self) -> None:
-        self._container.close()
-
-    def _facts(self) -> MovieFacts:
-        path, stream, container = self.path, self._stream, self._container
+    def _open(self) -> MovieFacts:
+        path = self.path
+        self._container, self._stream = container, stream = self._opened.enter_context(_open_stream(path))
         codec = stream.codec_context
         notes = notes_in(container.metadata.get("description", ""), path)
         refuse_drawn(notes, path)
@@ -88,18 +77,11 @@ class VideoMovie(Movie):
         self._first_ns = notes.first_stamp_ns if notes is not None else 0
         if codec.pix_fmt is None:
             raise MovieError(f"{path}: no pixel format is known of {codec.name}; the file is damaged or was cut short")
-        bits = av.VideoFormat(codec.pix_fmt).components[0].bits
         pts, damaged = self._packets()
         if not pts:
             raise MovieError(f"{path}: holds no image; the file is damaged or was cut short")
         self._pts = sorted(p for p in pts if p is not None)
-        timed = len(self._pts) == len(pts)
-        rate = stream.average_rate or stream.guessed_rate
-        nominal = container.format.name in _NOMINAL
-        times, text = None, ""
-        if timed and (not nominal or rate):
-            times = np.array([self._time_ns(p) for p in self._pts], np.int64)
-            text = _times_text(times, nominal, float(rate) if rate else 0.0)
+        times, text = self._times(all_timed=len(self._pts) == len(pts))
         promised = self._header_frames(times)
         if promised > len(pts) or damaged:
             why = f"breaks off: its header promises {max(promised, len(pts))} images, {len(pts) - damaged} are there"
@@ -107,24 +89,22 @@ class VideoMovie(Movie):
             pts = pts[: len(pts) - damaged]
             self._pts = sorted(p for p in pts if p is not None)
             times = times[: len(pts)] if times is not None else None
-        colour_range = _RANGES.get(int(codec.color_range), "")
-        if codec.pix_fmt.startswith("yuvj"):
-            colour_range = _RANGES[2]
-        lossy = codec.name not in _LOSSLESS
+        bits = av.VideoFormat(codec.pix_fmt).components[0].bits
+        levels = _RANGES.get(2 if codec.pix_fmt.startswith("yuvj") else int(codec.color_range), "")
+        self._note_unusual()
         return MovieFacts(
             reader="video",
             library=f"PyAV {av.__version__} (libavcodec {'.'.join(map(str, av.library_versions['libavcodec']))})",
-            codec=f"{codec.name} {codec.pix_fmt}" + (f", luma of {colour_range}" if colour_range else ""),
-            lossy=lossy,
+            codec=f"{codec.name} {codec.pix_fmt}" + (f", luma of {levels}" if levels else ""),
+            lossy=codec.name not in _LOSSLESS,
             width_px=width,
             height_px=height,
-            bits=depth_of(bits, self.options.bits),
+            bits=self._depth(bits, bits),
             frames=len(pts),
             counted=False,
             times_ns=times,
             times=text,
             um_per_px=notes.um_per_px if notes is not None else None,
-            remarks=tuple(self._unusual()),
             notes=notes,
         )
 
@@ -153,13 +133,30 @@ class VideoMovie(Movie):
         missing = (duration * (NS_PER_S / av.time_base) - float(times[-1])) / interval
         return len(times) + round(missing) - 1 if missing > 3.5 else 0
 
-    def _unusual(self) -> Iterator[str]:
-        stream = self._stream
-        aspect = stream.sample_aspect_ratio
+    def _note_unusual(self) -> None:
+        aspect, streams = self._stream.sample_aspect_ratio, len(self._container.streams.video)
         if aspect is not None and aspect not in (0, 1):
-            yield f"its pixels are said to be {aspect.numerator}:{aspect.denominator}; they are taken as square"
-        if len(self._container.streams.video) > 1:
-            yield f"it has {len(self._container.streams.video)} video streams; the best one is read"
+            pixels = f"{aspect.numerator}:{aspect.denominator}"
+            self._assumed.append(f"its pixels are said to be {pixels}; they are taken as square")
+        if streams > 1:
+            self._assumed.append(f"it has {streams} video streams; the best one is read")
+
+    def _times(self, *, all_timed: bool) -> tuple[NDArray[np.int64] | None, str]:
+        """Times of the images, and where they come from."""
+        rate = self._stream.average_rate or self._stream.guessed_rate
+        nominal = self._container.format.name in _NOMINAL
+        if not all_timed or (nominal and not rate):
+            return None, ""
+        times = np.array([self._time_ns(p) for p in self._pts], np.int64)
+        if nominal:
+            return times, f"the file's nominal rate, {float(rate):g} Hz; it does not say when each image was taken"
+        steps_ms = np.diff(times) / 1e6
+        if not len(steps_ms):
+            return times, "presentation times"
+        low, high = steps_ms.min(), steps_ms.max()
+        if high - low > _ROUNDED_MS:
+            return times, f"presentation times, intervals of {low:.4g} to {high:.4g} ms"
+        return times, f"presentation times, every {steps_ms.mean():.4g} ms"
 
     def _time_ns(self, pts: int) -> int:
         """A presentation time since the first image: containers begin at times that the encoder's delay determines.
@@ -171,54 +168,51 @@ class VideoMovie(Movie):
         return self._first_ns + since_ns
 
     def frames(self) -> Iterator[MovieFrame]:
-        count = 0
-        container, stream = _open_stream(self.path)
+        count, timed = 0, self.facts.times_ns is not None
         try:
-            for frame in self._decode(container, stream):
-                if count == self.facts.frames:
-                    break  # what follows is cut off
-                time_ns = (
-                    self._time_ns(frame.pts) if frame.pts is not None and self.facts.times_ns is not None else None
-                )
-                yield MovieFrame(count, self._grey(frame, count), time_ns)
-                count += 1
+            with closing(self._decode()) as decoded:
+                for frame in decoded:
+                    if count == self.facts.frames:
+                        break  # what follows is cut off
+                    time_ns = self._time_ns(frame.pts) if frame.pts is not None and timed else None
+                    yield MovieFrame(count, self._levels(frame, count), time_ns)
+                    count += 1
         except av.FFmpegError as error:
             self.broken_off(count, f"image {count} can not be decoded ({_text(error)})", error)
-        finally:
-            container.close()
         if self.options.partial and count < self.facts.frames:
             self.broken_off(count, "the rest can not be decoded")
         if not count:
             raise MovieError(f"{self.path}: no image of it can be decoded; the file is damaged")
 
-    def _decode(self, container: Any, stream: Any) -> Iterator[Any]:
-        frames = container.decode(stream)
-        while True:
-            with _complaints(stream) as complaints:
-                frame = next(frames, None)
-            if frame is None:
-                return
-            if frame.is_corrupt or complaints:
-                raise av.InvalidDataError(0, "its data is damaged")
-            yield frame
+    def _decode(self, first: int | None = None) -> Generator[Any]:
+        """The images in order, from the beginning, or from one before a presentation time on."""
+        with _open_stream(self.path) as (container, stream):
+            if first is not None:
+                container.seek(first, stream=stream, backward=True)
+            frames = container.decode(stream)
+            while True:
+                with _complaints(stream) as complaints:
+                    frame = next(frames, None)
+                if frame is None:
+                    return
+                if frame.is_corrupt or complaints:
+                    raise av.InvalidDataError(0, "its data is damaged")
+                yield frame
 
     def image(self, index: int) -> Image:
         if not self._pts:
             return next(each.image for each in self.frames() if each.index == index)
         target = self._pts[index]
-        container, stream = _open_stream(self.path)
         try:
-            container.seek(target, stream=stream, backward=True)
-            for frame in self._decode(container, stream):
-                if frame.pts is not None and frame.pts >= target:
-                    return self._grey(frame, index)
+            with closing(self._decode(target)) as decoded:
+                for frame in decoded:
+                    if frame.pts is not None and frame.pts >= target:
+                        return self._levels(frame, index)
         except av.FFmpegError as error:
             raise MovieError(f"{self.path}: image {index} can not be decoded ({_text(error)})") from error
-        finally:
-            container.close()
         raise MovieError(f"{self.path}: image {index} is not there; the movie ends before it")
 
-    def _grey(self, frame: Any, index: int) -> Image:
+    def _levels(self, frame: Any, index: int) -> Image:
         """Grey levels (h, w) of a decoded image."""
         facts, channel, name = self.facts, self.options.channel, frame.format.name
         padded = facts.notes is not None and frame.width - facts.width_px in (0, 1)
@@ -228,17 +222,18 @@ class VideoMovie(Movie):
                 f"{facts.width_px} x {facts.height_px}; cut the movie where its size changes"
             )
         if channel in CHANNELS[:3] and not name.startswith("gray"):
-            return grey_image(frame.to_ndarray(format="rgb24"), channel, facts.bits, self.path, index)
+            return self._grey(frame.to_ndarray(format="rgb24"), index)
         luma = _luma(frame)
         if luma is None:
             array = frame.to_ndarray(format="rgb24" if frame.format.components[0].bits <= 8 else "rgb48le")
-            return grey_image(array, channel, facts.bits, self.path, index)
+            return self._grey(array, index)
         if channel is None and _has_colour(frame):
             raise refuse_colour(self.path, index)
-        return grey_image(luma[: facts.height_px, : facts.width_px], channel, facts.bits, self.path, index)
+        return self._grey(luma[: facts.height_px, : facts.width_px], index)
 
 
-def _open_stream(path: Path) -> tuple[Any, Any]:
+@contextmanager
+def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its video stream, with a decoder that reports damaged data instead of concealing it."""
     try:
         container = av.open(str(path), options={"err_detect": "explode"})
@@ -246,13 +241,13 @@ def _open_stream(path: Path) -> tuple[Any, Any]:
         raise MovieError(
             f"{path}: is no movie that can be read ({_text(error)}); if it was cut short, ffmpeg may repair it"
         ) from error
-    stream = container.streams.best("video")
-    if stream is None:
-        container.close()
-        raise MovieError(f"{path}: has no video stream")
-    stream.thread_type = "NONE" if stream.codec_context.name in _ONLY_LOGS else "AUTO"
-    stream.codec_context.options = {"err_detect": "explode"}
-    return container, stream
+    with container:
+        stream = container.streams.best("video")
+        if stream is None:
+            raise MovieError(f"{path}: has no video stream")
+        stream.thread_type = "NONE" if stream.codec_context.name in _ONLY_LOGS else "AUTO"
+        stream.codec_context.options = {"err_detect": "explode"}
+        yield container, stream
 
 
 @contextmanager
@@ -272,18 +267,9 @@ def _complaints(stream: Any) -> Iterator[list[str]]:
         av.logging.set_level(level)
 
 
-def _times_text(times: NDArray[np.int64], nominal: bool, rate_hz: float) -> str:
-    """Origin of the times, as text."""
-    if nominal:
-        return f"the file's nominal rate, {rate_hz:g} Hz; it does not say when each image was taken"
-    steps_ms = np.diff(times) / 1e6
-    if not len(steps_ms):
-        return "presentation times"
-    low, high = steps_ms.min(), steps_ms.max()
-    spread = (
-        f"intervals of {low:.4g} to {high:.4g} ms" if high - low > _ROUNDED_MS else f"every {steps_ms.mean():.4g} ms"
-    )
-    return f"presentation times, {spread}"
+def _samples(plane: Any) -> NDArray[np.uint8]:
+    """(rows, bytes of a line) of a plane."""
+    return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
 
 
 def _luma(frame: Any) -> NDArray[Any] | None:
@@ -292,8 +278,7 @@ def _luma(frame: Any) -> NDArray[Any] | None:
     if name.endswith("be"):
         frame = frame.reformat(format=name[:-2] + "le")
     dtype = pixel_type(frame.format.components[0].bits)
-    plane = frame.planes[0]
-    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[:height]
+    rows = _samples(frame.planes[0])[:height]
     if name in _PACKED_LUMA:
         return rows[:, _PACKED_LUMA[name] : 2 * width : 2]
     if not name.startswith(_PLANAR_LUMA) or name.startswith(("ya8", "ya16")):
@@ -308,16 +293,12 @@ def _has_colour(frame: Any) -> bool:
     if name.startswith("gray"):
         return False
     if name in _PACKED_LUMA:
-        plane, first = frame.planes[0], 1 - _PACKED_LUMA[name]
-        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-        samples = [rows[: frame.height, first : 2 * frame.width : 2]]
+        samples = [_samples(frame.planes[0])[: frame.height, 1 - _PACKED_LUMA[name] : 2 * frame.width : 2]]
     else:
         if bits > 8 or name.endswith("be"):  # compared with 8 bit
             frame = frame.reformat(format="yuv444p")
-        samples = []
-        for plane in frame.planes[1:3]:
-            used = plane.width * (2 if name.startswith("nv") else 1)
-            samples.append(np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, :used])
+        pair = 2 if name.startswith("nv") else 1
+        samples = [_samples(plane)[: plane.height, : pair * plane.width] for plane in frame.planes[1:3]]
     return any(float((np.abs(each.astype(np.int16) - 128) > _GREY_CHROMA).mean()) > _COLOURED_SHARE for each in samples)
 
 

@@ -1,6 +1,6 @@
 """The axes of camera and coils against what image and motion show, before a run, in an import and by the doctor.
 
-The image is compared with the walls of the chip (measure/picture_orientation.py). Where that does not decide, the
+The image is compared with the walls of the chip (measure/picture_registration.py). Where that does not decide, the
 motion does: of a robot that is driven in the check at the beginning of a run (control/axes_check.py), of a movie
 here, over all of it, against the log of the coils.
 """

@@ -25,8 +25,7 @@ import numpy as np
 
 from flowrec.core.errors import ChipError
 from flowrec.measure.picture_registration import register
-from flowrec.measure.wall_fit import WallMap
-from flowrec.measure.wall_search import WallSearch
+from flowrec.measure.wall_search import WallMap, WallSearch
 from flowrec.physics.chip.chip import Chip, ChipSettings
 from flowrec.physics.chip.io import load_chip
 from flowrec.physics.chip.registration import Calibration
@@ -275,9 +274,9 @@ def ecc(case: Case, start: Calibration) -> Calibration | None:
 def rivals(case: Case) -> dict[str, object]:
     walls = WallMap(case.chip.mask, case.chip.um_per_px)
     t0 = time.process_time()
-    first = WallSearch(
-        case.image.astype(np.float32), case.chip.mask, case.chip.um_per_px, walls.clearance_um
-    ).candidates((case.about_um / 1.12, case.about_um * 1.12), (False, True), 4)
+    first = WallSearch(case.image.astype(np.float32), walls).candidates(
+        (case.about_um / 1.12, case.about_um * 1.12), (False, True), 4
+    )
     t1 = time.process_time()
     rival = log_polar(case)
     t2 = time.process_time()

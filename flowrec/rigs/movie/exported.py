@@ -5,7 +5,7 @@ It is in what flowrec writes into a movie (movies/notes.py), and in config.toml 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +20,8 @@ _SECTIONS = ("robot", "camera", "coils")
 _SETTINGS, _CHIP = "config.toml", "chip.png"  # in a folder of tables
 
 
-@dataclass(frozen=True, slots=True)
-class Exported:
-    """A session as its exports state it.
-
-    Attributes
-    ----------
-    key : `Session.key`; "" if it is not stated.
-    settings : of the sections robot, camera and coils.
-    chip : path of the chip, as in chip.path.
-    """
-
-    key: str
-    settings: dict[str, dict[str, Any]]
-    chip: str
+# Settings of the sections robot, camera and coils, and the chip, as in chip.path.
+_Facts = tuple[dict[str, dict[str, Any]], str]
 
 
 def session_of_log(log: Path) -> str:
@@ -60,7 +48,8 @@ def with_exported(asked: Config) -> tuple[Config, list[str]]:
     found = _of_movie(facts, asked.movie.path) or _of_folder(asked.movie.coils, facts)
     if found is None:
         return asked, []
-    told = config_from_tree(found.settings, f"{asked.movie.path}: the settings that flowrec wrote")
+    settings, chip = found
+    told = config_from_tree(settings, f"{asked.movie.path}: the settings that flowrec wrote")
     default, changed, taken = Config(), asked, list[str]()
     for section in _SECTIONS:
         given, stated, usual = (getattr(config, section) for config in (asked, told, default))
@@ -75,12 +64,12 @@ def with_exported(asked: Config) -> tuple[Config, list[str]]:
         changed = replace(changed, **{section: replace(given, **new)})
         taken += [f"{section}.{name} = {value}" for name, value in new.items()]
     if not asked.chip.path:
-        changed = replace(changed, chip=replace(asked.chip, path=found.chip))
+        changed = replace(changed, chip=replace(asked.chip, path=chip))
         taken.append("the chip")
     return changed, taken
 
 
-def _of_movie(facts: MovieFacts, path: str) -> Exported | None:
+def _of_movie(facts: MovieFacts, path: str) -> _Facts | None:
     notes = facts.notes
     if notes is None:
         return None
@@ -89,21 +78,21 @@ def _of_movie(facts: MovieFacts, path: str) -> Exported | None:
     except (ValueError, RecursionError) as error:
         raise MovieError(f"{path}: the settings in it are damaged ({error}); export the session again") from error
     settings["camera"] = {**settings.get("camera", {}), "um_per_px": notes.um_per_px}
-    return Exported(notes.session_key, settings, path)
+    return settings, path
 
 
-def _of_folder(log: str, facts: MovieFacts) -> Exported | None:
+def _of_folder(log: str, facts: MovieFacts) -> _Facts | None:
     """Facts from the folder of tables in which a log is."""
-    folder, key = Path(log).parent, session_of_log(Path(log)) if log else ""
+    folder = Path(log).parent
     settings, chip = folder / _SETTINGS, folder / _CHIP
-    if not key or not settings.is_file() or not chip.is_file():
+    if not log or not session_of_log(Path(log)) or not settings.is_file() or not chip.is_file():
         return None
     tree = read_toml(settings)
     found = _run_facts(tree)
     camera = tree.get("camera", {})
     if (camera.get("width_px"), camera.get("height_px")) != (facts.width_px, facts.height_px):
         found.pop("camera", None)  # the movie was cut or scaled
-    return Exported(key, found, str(chip))
+    return found, str(chip)
 
 
 def _run_facts(tree: dict[str, Any]) -> dict[str, Any]:

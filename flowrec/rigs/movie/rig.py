@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 from flowrec.core import Currents, Phase, UsageError, nanoseconds, seconds
@@ -16,10 +17,11 @@ from flowrec.rigs.movie.source import MovieSource
 from flowrec.stages import PHASES, Config, FieldLog, Inputs, Pipeline, ResolvedConfig
 
 _MARGIN = 1.2  # of the robot's top speed over the fastest rotation in the log
+# What no file tells, and how it is given.
 _ASKED = {
-    "camera.um_per_px": ("camera", "um_per_px = 2.0  # size of a pixel of the movie in the plane of the robot"),
-    "robot.radius_um": ("robot", "radius_um = 25.0"),
-    "chip.path": ("chip", 'path = "chip.png"  # mask of the channels; openings in chip.toml beside it'),
+    "camera.um_per_px": "[camera] um_per_px = 2.0",
+    "robot.radius_um": "[robot] radius_um = 25.0",
+    "chip.path": '[chip] path = "chip.png"',
 }
 
 
@@ -117,18 +119,15 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
             known["max_speed_um_s"] = round(_MARGIN * robot.um_per_rev * fastest_hz, 3)
         if log is not None and robot.step_out_hz is None:
             known["step_out_hz"] = round(_MARGIN * float(log.frequency_hz.max()), 6)
-        mission = config.mission
+        mission, refine = config.mission, config.refine
         if mission.phases == PHASES:
             mission = replace(mission, phases=(Phase.OBSERVE,))
-        refine = config.refine
         if log is None and not config.movie.drifts:
             refine = replace(refine, observes_flow=False)
         remarks = list(source.remarks)
-        if facts.um_per_px is not None and config.camera.um_per_px is not None:
-            ratio = config.camera.um_per_px / facts.um_per_px
-            if abs(ratio - 1.0) > 0.01:
-                used = config.camera.um_per_px
-                remarks.append(f"the file says {facts.um_per_px:.6g} um per pixel; camera.um_per_px = {used:g} is used")
+        told, used = facts.um_per_px, config.camera.um_per_px
+        if told is not None and used is not None and abs(used / told - 1.0) > 0.01:
+            remarks.append(f"the file says {told:.6g} um per pixel; camera.um_per_px = {used:g} is used")
         changed = replace(
             config,
             camera=replace(config.camera, **camera),
@@ -155,19 +154,10 @@ def _with_notes(config: Config, source: MovieSource) -> Config:
 
 
 def _refuse_missing(config: Config, source: MovieSource) -> None:
-    given = {
-        f"{section}.{key}": value
-        for section in ("camera", "robot", "chip")
-        for key, value in asdict(getattr(config, section)).items()
-    }
-    missing = [key for key in _ASKED if given[key] in (None, "")]
+    missing = [key for key in _ASKED if attrgetter(key)(config) in (None, "")]
     if not missing:
         return
-    sections: dict[str, list[str]] = {}
-    for key in missing:
-        section, line = _ASKED[key]
-        sections.setdefault(section, []).append(line.partition("  #")[0])
-    example = " ".join(f"[{section}] {' '.join(lines)}" for section, lines in sections.items())
+    example = " ".join(_ASKED[key] for key in missing)
     hint = f" (the file says {source.facts.um_per_px:.6g} um per pixel)" if source.facts.um_per_px is not None else ""
     raise UsageError(
         f"{source.path}: {source.facts.describe()}; it does not tell {', '.join(missing)}{hint}; give them in a TOML "

@@ -38,7 +38,6 @@ class MovieSource:
     Attributes
     ----------
     facts : what the movie tells.
-    times_text : where the times come from.
     first_ns : time of the first image on the movie's clock.
     stamps_ns : (n,) expected stamps of the images; of a few movies the images themselves tell better.
     log : what the coils did; None: there is no log.
@@ -61,12 +60,12 @@ class MovieSource:
         try:
             self.facts: MovieFacts = self._movie.facts
             self._times = frame_times(self.path, self.facts, settings.times, settings.rate_hz)
-            self.times_text = self._times.text
-            first_ns, _ = self._times.of(
-                0, None if self.facts.times_ns is None else int(self.facts.times_ns[0]), self.path
-            )
-            self.first_ns = first_ns
-            self.stamps_ns = self._stamps_ns()
+            times = self._times.times_ns
+            if times is None:
+                times = np.array([self._times.of(n, None, self.path)[0] for n in range(self.facts.frames)], np.int64)
+            first = None if self.facts.times_ns is None else int(self.facts.times_ns[0])
+            self.first_ns, _ = self._times.of(0, first, self.path)
+            self.stamps_ns = self._stamps(times)
             self._log_remarks: list[str] = []
             self.log_delayed = bool(settings.coils) and is_of_session(Path(settings.coils))
             self.log = self._read_log(coils)
@@ -97,7 +96,7 @@ class MovieSource:
         before, count = -1, 0
         for image in self._movie.frames():
             time_ns, number = self._times.of(image.index, image.time_ns, self.path)
-            stamp_ns = self._stamp_ns(time_ns)
+            stamp_ns = int(self._stamps(np.array(time_ns)))
             if stamp_ns <= before:
                 raise MovieError(
                     f"{self.path}: the time of image {image.index}, {seconds(time_ns):.6f} s, is not after that of the "
@@ -121,7 +120,7 @@ class MovieSource:
             "source_reader": f"{facts.reader}, {facts.library}",
             "source_codec": (facts.codec or "uncompressed") + (", lossy" if facts.lossy else ""),
             "source_images": f"{facts.width_px} x {facts.height_px} x {facts.bits} bit",
-            "source_times": self.times_text,
+            "source_times": self._times.text,
             "source_first_image_s": f"{seconds(self.first_ns):.9f}",
         }
         if facts.um_per_px is not None:
@@ -153,15 +152,9 @@ class MovieSource:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _stamp_ns(self, time_ns: int) -> int:
-        since_ns, rate = time_ns - self.first_ns, self._settings.clock_rate
-        return since_ns if rate == 1.0 else round(since_ns * rate)
-
-    def _stamps_ns(self) -> NDArray[np.int64]:
-        times = self._times.times_ns
-        if times is None:
-            times = np.array([self._times.of(n, None, self.path)[0] for n in range(self.facts.frames)], np.int64)
-        since, rate = times - self.first_ns, self._settings.clock_rate
+    def _stamps(self, times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Session stamps of times on the movie's clock."""
+        since, rate = times_ns - self.first_ns, self._settings.clock_rate
         return since if rate == 1.0 else np.rint(since * rate).astype(np.int64)
 
     def _read_log(self, coils: Coils) -> FieldLog | None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flowrec.measure.picture_orientation import orientation_by_image
+from flowrec.measure.picture_registration import orientation_by_image
 from flowrec.physics.chip.chip import ChipSettings
 from flowrec.physics.chip.io import load_chip
 from flowrec.physics.chip.orientation import AS_STATED, ORIENTATIONS, nearest

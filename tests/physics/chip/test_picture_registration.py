@@ -10,8 +10,8 @@ import pytest
 from flowrec.core.errors import ChipError
 from flowrec.measure import wall_fit
 from flowrec.measure.picture_registration import fit_nearby, other_scale, overlay, register
-from flowrec.measure.wall_fit import Fitter, WallMap
-from flowrec.measure.wall_search import Pose
+from flowrec.measure.wall_fit import Fitter
+from flowrec.measure.wall_search import Pose, WallMap
 from flowrec.physics.chip.chip import ChipSettings
 from flowrec.physics.chip.clearance import median_width_um
 from flowrec.physics.chip.io import load_chip

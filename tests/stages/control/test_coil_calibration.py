@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 from flowrec.core.errors import UsageError
 from flowrec.core.system.outputs import OutputError
-from flowrec.measure.calibrate_coils import as_sets, calibrate_coils
+from flowrec.measure.calibrate_coils import calibrate_coils, settings_of
 from flowrec.measure.coil_calibration import Excitations, advice, fit_coils, read_excitations
+from flowrec.measure.proposal import as_sets
 from flowrec.stages.config import load_config
 from flowrec.verbs.cli import app
 
@@ -157,7 +158,7 @@ def test_a_run_takes_the_written_settings_and_the_printed_ones_alike(tmp_path):
     path, out = file_of(tmp_path, measured(5)), tmp_path / "out.toml"
     fit = calibrate_coils(path, out)
     written = load_config(out).coils
-    assert written == load_config(None, as_sets(fit)).coils
+    assert written == load_config(None, as_sets(settings_of(fit))).coils
     np.testing.assert_allclose(written.mt_per_a, fit.mt_per_a, atol=0.01 * fit.mt_per_a_std.max())
     assert "12 excitations" in out.read_text() and "sha256" in out.read_text()
     with pytest.raises(OutputError, match="--overwrite"):

@@ -1,0 +1,75 @@
+"""Images as the calibrations see them: types of arrays, and what several of them do with an image or a mask."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import Image
+
+Floats = NDArray[np.float64]
+Levels = NDArray[np.float32]  # grey levels, or what is computed of them
+Mask = NDArray[np.bool_]
+Colours = NDArray[np.uint8]  # (h, w, 3), blue first
+ORANGE = (0, 140, 255)  # blue, green, red
+_SHIFT = 4  # bits after the binary point of drawn points
+
+
+def blur_image(image: Levels, sigma_px: float) -> Levels:
+    """An image (h, w) after a Gaussian blur; beyond the border its edge goes on."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+def slopes(image: Levels, *orders: tuple[int, int], scale: float = 1.0) -> list[Levels]:
+    """Sobel's derivatives (h, w) of these orders to the right and down."""
+    return [
+        np.asarray(
+            cv2.Sobel(image, cv2.CV_32F, *each, ksize=3, scale=scale, borderType=cv2.BORDER_REPLICATE), np.float32
+        )
+        for each in orders
+    ]
+
+
+def gradient(image: Levels) -> list[Levels]:
+    """Sobel's derivatives (h, w) to the right and down."""
+    return slopes(image, (1, 0), (0, 1))
+
+
+def shrink(image: NDArray[np.float32 | np.uint8], size_px: tuple[int, int]) -> Levels:
+    """An image averaged over areas, of a size (width, height)."""
+    return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def as_points(curves: Iterable[Floats]) -> list[NDArray[np.int32]]:
+    """Curves (n, 2) in px as OpenCV draws them, to a sixteenth of a pixel."""
+    return [np.rint(curve * 2**_SHIFT).astype(np.int32) for curve in curves]
+
+
+def draw_curves(
+    canvas: NDArray[np.uint8],
+    curves: Iterable[Floats],
+    width_px: int,
+    colour: Sequence[float] = (1,),
+    line: int = cv2.LINE_8,
+) -> NDArray[np.uint8]:
+    """Draw closed curves (n, 2); returns the canvas."""
+    cv2.polylines(canvas, as_points(curves), True, colour, width_px, line, _SHIFT)
+    return canvas
+
+
+def fill_curves(canvas: NDArray[np.uint8], curves: Iterable[Floats]) -> None:
+    """Fill what an odd number of closed curves (n, 2) is around."""
+    cv2.fillPoly(canvas, as_points(curves), 255, cv2.LINE_8, _SHIFT)
+
+
+def with_curves(picture: Image, curves: Iterable[Floats]) -> tuple[Colours, int]:
+    """A picture (h, w, 3), blue first, with closed curves in orange, and the width of their lines in px."""
+    grey = picture.astype(np.float32)
+    low, high = np.percentile(grey, (0.5, 99.5))
+    shown = np.clip(255.0 * (grey - low) / max(float(high - low), 1.0), 0, 255).astype(np.uint8)
+    width_px = max(1, round(max(grey.shape) / 800))
+    drawn = np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR), np.uint8)
+    return draw_curves(drawn, curves, width_px, ORANGE, cv2.LINE_AA), width_px
