@@ -28,6 +28,7 @@ from flowrec.core.enums import WorkOrder
 from flowrec.core.errors import NotFiniteError
 from flowrec.core.units import seconds
 
+Floats = NDArray[np.float64]
 # The annotation is the wire form: a `vector` becomes a repeated double that viewers can plot,
 # an `array` keeps its shape and its bytes.
 Vector = Annotated[NDArray[np.float64], "vector"]

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     Action,
     Alarm,
     AxesVerdict,
     Event,
+    Floats,
     FlowField,
     Health,
     Level,
@@ -179,7 +179,7 @@ def _steering(event: OperatorEvent, mission: Mission) -> Line:
     return f"operator: {why}", Level.WARNING
 
 
-def _place(point_um: NDArray[np.float64]) -> str:
+def _place(point_um: Floats) -> str:
     return f"{point_um[0]:.0f}, {point_um[1]:.0f} um"
 
 

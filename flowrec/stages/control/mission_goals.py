@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowField, Mission, Phase, Route, WorkOrder
+from flowrec.core import Floats, FlowField, Mission, Phase, Route, WorkOrder
 from flowrec.stages.control.mission_steps import MissionInputs, order, transition
 from flowrec.stages.control.trajectory import position_at
 
@@ -51,7 +50,7 @@ def with_speed_limit(mission: Mission, now: MissionInputs) -> Mission:
 
 
 def routine_order(
-    previous: Mission, now: MissionInputs, phase: Phase, note: str, start_um: NDArray[np.float64] | None = None
+    previous: Mission, now: MissionInputs, phase: Phase, note: str, start_um: Floats | None = None
 ) -> Mission:
     """A new order of a route that no disturbance has caused; it begins at the robot unless stated."""
     changes = {} if start_um is None else {"start_um": start_um}

@@ -23,11 +23,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Range, Share, seconds
+from flowrec.core import Alarm, Applied, Estimate, Floats, FlowField, Health, Range, Share, seconds
 from flowrec.physics import Robot, sample
 from flowrec.stages.estimation.step_out import StepOut
 
-Floats = NDArray[np.float64]
 Resonators = NDArray[np.complex128]
 
 _BANK_HZ, _STEP, _ABOVE = 0.3, 1.125, 24  # of the bank: a frequency, the ratio of neighbours, how many from there on
@@ -138,7 +137,7 @@ class HealthMonitor:
 
 def _flow_deviation(estimate: Estimate, expected_um_s: Floats, robot: Robot) -> float:
     """Deviation of the flow's strength from an expected flow (2,), relative to it; -1 to 1."""
-    speed = max(math.hypot(expected_um_s[0], expected_um_s[1]), _SLOW_FRACTION * robot.max_speed_um_s)
+    speed = max(math.hypot(*expected_um_s), _SLOW_FRACTION * robot.max_speed_um_s)
     deviation = float((estimate.flow_um_s - expected_um_s) @ expected_um_s) / speed**2
     return min(max(deviation, -1.0), 1.0)
 

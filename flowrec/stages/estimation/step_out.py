@@ -84,7 +84,7 @@ class StepOut:
         wall_um : from the robot's centre to the nearest wall, which may stop the robot.
         """
         own_hz = robot.step_out_margin * robot.step_out_hz
-        dt, turns = seconds(estimate.stamp_ns - before.stamp_ns), math.hypot(applied.turns[0], applied.turns[1])
+        dt, turns = seconds(estimate.stamp_ns - before.stamp_ns), math.hypot(*applied.turns)
         limited_ns, rolled_before = previous.limited_ns, previous.rolled_before_um_s
         now = replace(
             now,
@@ -103,7 +103,7 @@ class StepOut:
         heading = applied.turns / turns
         carried = dt * sample(field, 0.5 * (before.measured_um + estimate.measured_um))
         rolled_um = float((estimate.measured_um - before.measured_um - carried) @ heading)
-        newest = np.array([rolled_um, robot.um_per_rev * turns, math.hypot(carried[0], carried[1]), dt])
+        newest = np.array([rolled_um, robot.um_per_rev * turns, math.hypot(*carried), dt])
         window_s = self._window_s(robot, dt)
         sums = newest + math.exp(-dt / window_s) * (previous.rolled_sums if previous.rolled_sums.size else 0.0)
         now = replace(now, rolled_sums=sums)

@@ -15,9 +15,8 @@ import math
 from array import array
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Appearance, Shift, Tick, Track, seconds, shift_px
+from flowrec.core import Appearance, Floats, Shift, Tick, Track, seconds, shift_px
 from flowrec.physics import Calibration, Robot
 from flowrec.stages.vision.foreground import correlation
 from flowrec.stages.vision.learned import ReducedScale
@@ -151,7 +150,7 @@ class TrackQuality:
         return f"{count} of {self._count} images"
 
 
-def _has_rival(track: Track, place_px: NDArray[np.float64]) -> bool:
+def _has_rival(track: Track, place_px: Floats) -> bool:
     """True if another body of like energy is where the robot may be as well."""
     others = track.neighbours_px.reshape(-1, 3)
     if not len(others) or track.energy <= 0.0:
