@@ -112,12 +112,19 @@ def _of_turns(times_s: Floats, turns_x: Floats, turns_y: Floats, amplitude: Floa
 
     The field lasts where it turned, also if it is switched on or off between the two rows.
     """
-    frequency, heading, held = np.zeros(len(times_s)), np.zeros(len(times_s)), amplitude.copy()
-    lasts_s = np.diff(times_s)
-    frequency[:-1] = np.hypot(turns_x[1:], turns_y[1:]) / np.where(lasts_s > 0.0, lasts_s, np.inf)
-    heading[:-1] = np.arctan2(turns_y[1:], turns_x[1:])
+    frequency, heading = _from_turns(times_s, turns_x[1:], turns_y[1:])
+    held = amplitude.copy()
     held[:-1] = np.where(frequency[:-1] > 0.0, np.maximum(amplitude[:-1], amplitude[1:]), amplitude[:-1])
     return frequency, heading, held
+
+
+def _from_turns(times_s: Floats, along_x: Floats, along_y: Floats) -> tuple[Floats, Floats]:
+    """Frequency and heading (n,) of revolutions (n - 1,) from each row to the next; 0 from the last row on."""
+    lasts_s = np.diff(times_s)
+    frequency, heading = np.zeros(len(times_s)), np.zeros(len(times_s))
+    frequency[:-1] = np.hypot(along_x, along_y) / np.where(lasts_s > 0.0, lasts_s, np.inf)
+    heading[:-1] = np.arctan2(along_y, along_x)
+    return frequency, heading
 
 
 def is_of_session(path: Path) -> bool:
@@ -180,8 +187,4 @@ def _rotation(times_s: Floats, field_mt: Floats, coils: Coils, where: str) -> tu
     along = np.column_stack([turns[:, 1], -turns[:, 0]]) if coils.mode == "roller" else turns[:, :2]
     reversed_ = coils.surface == "ceiling" if coils.mode == "roller" else coils.handedness == "left"
     along = -along if reversed_ else along
-    lasts_s = np.diff(times_s)
-    frequency, heading = np.zeros(len(times_s)), np.zeros(len(times_s))
-    frequency[:-1] = np.hypot(along[:, 0], along[:, 1]) / np.where(lasts_s > 0.0, lasts_s, np.inf)
-    heading[:-1] = np.arctan2(along[:, 1], along[:, 0])
-    return frequency, heading, np.where(on, amplitude, 0.0)
+    return *_from_turns(times_s, *along.T), np.where(on, amplitude, 0.0)

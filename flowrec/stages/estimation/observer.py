@@ -12,7 +12,6 @@ from flowrec.core import (
     Alarm,
     Applied,
     Estimate,
-    Floats,
     FlowField,
     Health,
     Method,
@@ -49,7 +48,8 @@ OBSERVERS = Methods(
 class Luenberger:
     """`luenberger`, the disturbance observer of the paper, eq. (19): d vhat/dt = L_p (dx/dt - d xhat/dt).
 
-    With xhat' = u + vhat it is a first-order low-pass filter of the measured drift, discretised exactly."""
+    With xhat' = u + vhat it is a first-order low-pass filter of the measured drift, discretised exactly.
+    """
 
     gain_per_s: Annotated[float, Range(1e-3, 1e4)] = 1.0  # L_p, the same on both axes
     # one sigma, for the stated covariance only; None: 4 % of the radius
@@ -131,7 +131,7 @@ class Observer:
         settings, needs = row.section(self), row.needs
         used = "map" in needs or ("good map" in needs and self._good(previous, field, health))
         estimate: Estimate = settings.estimate(previous, track, applied, robot, field if used else None)
-        return replace(estimate, rolled_um_s=_rolled_um_s(previous, estimate, applied, robot))
+        return _with_own_motion(previous, estimate, applied, robot)
 
     def without_map(
         self,
@@ -156,8 +156,7 @@ class Observer:
             return previous
         if before is not None:
             before = self.measured_estimate(previous, before)
-        now = self.kalman.estimate(before, track, applied, robot)
-        return replace(now, rolled_um_s=_rolled_um_s(before, now, applied, robot))
+        return _with_own_motion(before, self.kalman.estimate(before, track, applied, robot), applied, robot)
 
     @staticmethod
     def measured_estimate(mapless: Estimate | None, estimate: Estimate) -> Estimate:
@@ -179,13 +178,14 @@ class Observer:
         return Alarm.NIS not in health.alarm.split("; ") and abs(health.offset_share) <= most
 
 
-def _rolled_um_s(previous: Estimate | None, estimate: Estimate, applied: Applied, robot: Robot) -> Floats:
-    """(2,) mean of the robot's own motion over the filter's memory, which is the delay of the estimated flow."""
+def _with_own_motion(previous: Estimate | None, estimate: Estimate, applied: Applied, robot: Robot) -> Estimate:
+    """The estimate with the robot's mean own motion over the filter's memory, which is the delay of its flow."""
     dt = 0.0 if previous is None else seconds(estimate.stamp_ns - previous.stamp_ns)
     if previous is None or dt <= 0.0:
-        return np.zeros(2) if previous is None else previous.rolled_um_s
+        return replace(estimate, rolled_um_s=np.zeros(2) if previous is None else previous.rolled_um_s)
     um_per_rev = robot.um_per_rev if estimate.um_per_rev is None else estimate.um_per_rev
     now = um_per_rev / dt * applied.turns
     before = previous.rolled_um_s if previous.rolled_um_s.size else now
     memory = memory_s(estimate.covariance)
-    return np.asarray(before + (1.0 - math.exp(-dt / memory) if memory > 0.0 else 1.0) * (now - before))
+    weight = 1.0 - math.exp(-dt / memory) if memory > 0.0 else 1.0
+    return replace(estimate, rolled_um_s=before + weight * (now - before))

@@ -76,10 +76,6 @@ class _Scene:
     calibration: Calibration
     robot: Robot
 
-    @property
-    def um_per_px(self) -> float:
-        return self.calibration.um_per_px
-
     def track(self, search: DiscSearch, found: Disc | None) -> Track:
         """The track of a disc. Where there is none the last place stays, before the first the middle of the image."""
         previous, radius_px = self.previous, search.expected_px
@@ -224,7 +220,7 @@ class Tracker:
         noise = pixel_noise(frame.image)
         dark = self._dark_disc(scene, search, noise) if assumed != "bright" else None
         if assumed != "dark":
-            radius_px = self._radius_px(scene.um_per_px, scene.robot)
+            radius_px = self._radius_px(scene.calibration.um_per_px, scene.robot)
             view = View(frame.image, scene.walls, radius_px, (1.0 + self.wall_error_radii) * radius_px)
             spot = brightest_spot(view, outstanding=assumed == "auto")
             if spot is not None and (dark is None or spot[1] > dark.darkness):
@@ -239,7 +235,7 @@ class Tracker:
         self, scene: _Scene, search: DiscSearch, at_px: tuple[float, float], polarity: str, what: str
     ) -> tuple[Track, Appearance]:
         """The track and the appearance after learning the robot's look at a point."""
-        view = self._view(scene, self._radius_px(scene.um_per_px, scene.robot))
+        view = self._view(scene, self._radius_px(scene.calibration.um_per_px, scene.robot))
         appearance = learn(view, scene.frame.stamp_ns, at_px, polarity, what)
         if appearance.note:
             return scene.track(search, None), appearance
@@ -331,18 +327,19 @@ class Tracker:
 
     def _range_px(self, scene: _Scene, radius_px: float, dt: float) -> float:
         """Search range around the last position of an image before."""
-        displacement = self.reach_speed * scene.robot.speed_limit_um_s * dt / scene.um_per_px
+        displacement = self.reach_speed * scene.robot.speed_limit_um_s * dt / scene.calibration.um_per_px
         return max(self.search_radii * radius_px + displacement, self.search_px)
 
     def _plan(self, scene: _Scene, *, everywhere: bool = False) -> DiscSearch:
         """Area of the search, from the previous message; or the whole channel."""
         previous, box = scene.previous, scene.walls.box
-        nominal = scene.robot.radius_um / scene.um_per_px
+        nominal = scene.robot.radius_um / scene.calibration.um_per_px
         centre, range_px, score, likeness = (0.0, 0.0), math.inf, self.acquire_score, self.acquire_likeness
         # A score of 0 means that the robot was never seen.
         lost = previous is None or previous.score <= 0 or previous.lost_frames > self.reacquire_after
         if previous is not None and not (lost or everywhere):
-            x, y = centre = tuple(scene.calibration.to_px(previous.position_um).tolist())
+            x, y = scene.calibration.to_px(previous.position_um).tolist()
+            centre = (x, y)
             frames = 1 + previous.lost_frames
             dt = seconds(scene.frame.stamp_ns - previous.stamp_ns) / frames
             range_px = self._range_px(scene, previous.radius_px, dt) * frames
@@ -358,7 +355,7 @@ class Tracker:
             range_px=range_px,
             nominal_px=nominal,
             expected_px=nominal if previous is None else previous.radius_px,
-            margin_px=min(max(self.wall_margin_um / scene.um_per_px, 1.0), 0.5 * nominal),
+            margin_px=min(max(self.wall_margin_um / scene.calibration.um_per_px, 1.0), 0.5 * nominal),
             least_score=score,
             least_likeness=likeness,
             least_contrast=self.least_contrast,
