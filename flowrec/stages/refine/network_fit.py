@@ -60,7 +60,7 @@ def torch_run(device: Device, threads: int, seed: int, setting: str) -> Iterator
 def adam(
     parameters: Iterator[nn.Parameter], rate: float, steps: int, warm_up: float, lowest: float = 0.0
 ) -> Callable[[Tensor], None]:
-    """A step down a loss, by Adam whose rate rises over `warm_up` steps and falls as half a cosine to `lowest` of it."""
+    """A step down a loss by Adam, whose rate rises over `warm_up` steps and falls as half a cosine to `lowest`."""
     import torch
 
     optimiser = torch.optim.Adam(parameters, lr=rate)

@@ -191,13 +191,14 @@ class Candidates:
 
 
 def candidates(
-    view: View, scale: ReducedScale, appearance: Appearance, box: Box, least_energy: float, near_px: Floats | None
+    view: View, appearance: Appearance, box: Box, least_energy: float, near_px: Floats | None
 ) -> tuple[ForegroundRegion, Candidates]:
     """The foreground of a box, and the objects centred there in the fluid.
 
     They are those nearest to a point, or without one those of most energy.
     """
-    region, distance_px = view.around(box, scale), view.walls.distance_px
+    scale, distance_px = ReducedScale(appearance.radius_px), view.walls.distance_px
+    region = view.around(box, scale)
     sign, noise = SIGNS[appearance.polarity], appearance.foreground_noise
     energy = energy_map(region.c, noise, sign, scale.energy)
     found = peaks(energy, max(least_energy, _LEAST_ENERGY), scale.apart, 4 * _ALL)
@@ -273,17 +274,12 @@ def assign_objects(found: Candidates, motion: ExpectedMotion, range_px: float) -
     return (int(chosen[0]) if chosen[0] < count else None), missed
 
 
-@dataclass(frozen=True, slots=True)
-class Merged:
-    """The robot and neighbours (k, 3) in one image."""
-
-    which: int
-    place_px: Floats  # (2,) of the robot
-    neighbours: Floats
-
-
-def find_merged(found: Candidates, which: int | None, motion: ExpectedMotion, missed: Floats) -> Merged | None:
+def find_merged(
+    found: Candidates, which: int | None, motion: ExpectedMotion, missed: Floats
+) -> tuple[int, Floats, Floats] | None:
     """The image that is the robot and missed neighbours (k, 3) together: it is near both and has the sum of energies.
+
+    Its number, and in px the place (2,) of the robot and those neighbours (k, 3); None: there is no such image.
 
     `which` is the candidate that is the robot; None: the one nearest to where it is expected, which then may be taken
     for a neighbour. Its centroid is that of all, and they lie to each other as before:
@@ -307,7 +303,7 @@ def find_merged(found: Candidates, which: int | None, motion: ExpectedMotion, mi
         return None
     offsets = motion.expected_px - near[:, :2]
     place_px = centroid + (near[:, 2:] * offsets).sum(axis=0) / total
-    return Merged(which, place_px, np.column_stack([place_px - offsets, near[:, 2]]))
+    return which, place_px, np.column_stack([place_px - offsets, near[:, 2]])
 
 
 def hidden_neighbours(missed: Floats, place_px: Floats, radius_px: float) -> Floats:
@@ -411,7 +407,7 @@ def with_motion(track: Track, motion: ExpectedMotion, to_px: Floats, energy: flo
 def neighbours_of(found: Candidates, robot: int | None) -> Floats:
     """Place and energy (3 k,) of all candidates but the robot."""
     rows = np.column_stack((found.px, found.energy))
-    return np.asarray(np.delete(rows, robot, axis=0).ravel() if robot is not None else rows.ravel())
+    return np.delete(rows, [] if robot is None else robot, axis=0).ravel()
 
 
 def is_isolated(neighbours_px: Floats, place_px: Floats, radius_px: float) -> bool:

@@ -13,7 +13,6 @@ from flowrec.stages.vision.learned import (
     ENERGY_SPREAD,
     SIGNS,
     ForegroundRegion,
-    ReducedScale,
     View,
     candidates,
     centroid_of,
@@ -154,7 +153,7 @@ def bodies_like(view: View, at_px: tuple[float, float], appearance: Appearance) 
     if look.note:  # nothing that stands out from the background: nothing else is like it
         return np.array([at_px])
     energy = energy_of(look)
-    found = candidates(view, ReducedScale(look.radius_px), look, view.walls.box, 0.1 * energy, None)[1]
+    found = candidates(view, look, view.walls.box, 0.1 * energy, None)[1]
     changed = np.log(np.maximum(found.energy, 1e-6) / energy) / ENERGY_SPREAD
     like = found.similarity * np.exp(-0.125 * changed**2)
     order = [number for number in np.argsort(-like, kind="stable").tolist() if like[number] >= _LEAST_LIKE]

@@ -31,7 +31,6 @@ from flowrec.stages.vision.disc_search import (
 from flowrec.stages.vision.learned import (
     Candidates,
     ExpectedMotion,
-    ReducedScale,
     View,
     alone,
     assign_objects,
@@ -241,7 +240,7 @@ class Tracker:
             return scene.track(search, None), appearance
         x, y = appearance.centre_px.tolist()
         box = _clip_box((x, y), 4.0 * view.radius_px, scene.walls.box)
-        found = candidates(view, ReducedScale(appearance.radius_px), appearance, box, 0.0, appearance.centre_px)[1]
+        found = candidates(view, appearance, box, 0.0, appearance.centre_px)[1]
         near = np.hypot(*(found.px - appearance.centre_px).T) < 0.7 * appearance.radius_px
         return replace(
             scene.track(search, Disc(x, y, search.expected_px, 0.0, 1.0, 1.0)),
@@ -256,18 +255,19 @@ class Tracker:
     ) -> tuple[Track, Appearance | None]:
         """The robot by its learned look: near where it is expected, then as far as it can be, or in the whole image."""
         frame, walls, calibration = scene.frame, scene.walls, scene.calibration
-        scale, view = ReducedScale(appearance.radius_px), self._view(scene, appearance.radius_px)
+        radius_px = appearance.radius_px
+        view = self._view(scene, radius_px)
         dt, frames = seconds(frame.stamp_ns - previous.stamp_ns), 1 + previous.lost_frames
-        motion = ExpectedMotion.after(previous, calibration.to_px(previous.position_um), scale.radius_px, dt)
+        motion = ExpectedMotion.after(previous, calibration.to_px(previous.position_um), radius_px, dt)
         expected = (float(motion.expected_px[0]), float(motion.expected_px[1]))
         everywhere = previous.lost_frames > self.reacquire_after
-        farthest_px = self._range_px(scene, scale.radius_px, dt) * frames
-        near_px = max(self.search_px, 4.0 * scale.radius_px, 6.0 * motion.spread_px)
+        farthest_px = self._range_px(scene, radius_px, dt) * frames
+        near_px = max(self.search_px, 4.0 * radius_px, 6.0 * motion.spread_px)
         which, joined, missed = None, None, np.zeros((0, 3))
         for range_px in (math.inf,) if everywhere else (near_px, max(farthest_px, 1.5 * near_px)):
             box = walls.box if everywhere else _clip_box(expected, range_px, walls.box)
             near = None if everywhere else motion.expected_px
-            region, found = candidates(view, scale, appearance, box, _ENERGY_SHARE * previous.energy, near)
+            region, found = candidates(view, appearance, box, _ENERGY_SHARE * previous.energy, near)
             if everywhere:
                 which = alone(found, previous.energy, self.acquire_score)
             else:
@@ -280,15 +280,16 @@ class Tracker:
         roi = np.array(box, np.float64)
         seen = replace(previous, stamp_ns=frame.stamp_ns, seen=True, lost_frames=0, roi_px=roi)
         if joined is not None:
-            neighbours = np.concatenate([neighbours_of(found, joined.which), joined.neighbours.ravel()])
-            return replace(seen, position_um=calibration.to_um(joined.place_px), neighbours_px=neighbours), appearance
+            merged, place_px, hidden = joined
+            neighbours = np.concatenate([neighbours_of(found, merged), hidden.ravel()])
+            return replace(seen, position_um=calibration.to_um(place_px), neighbours_px=neighbours), appearance
         if which is None:
             return replace(unseen(previous, frame.stamp_ns), roi_px=roi), appearance
         blocks, score = locate_robot(region, found, which, appearance)
         to_px = region.to_px(blocks)
-        covered = hidden_neighbours(missed, to_px, scale.radius_px)
+        covered = hidden_neighbours(missed, to_px, radius_px)
         neighbours = np.concatenate([neighbours_of(found, which), covered.ravel()])
-        isolated = is_isolated(neighbours, to_px, scale.radius_px)
+        isolated = is_isolated(neighbours, to_px, radius_px)
         track = replace(
             seen,
             position_um=calibration.to_um(to_px),
