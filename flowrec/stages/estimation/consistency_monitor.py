@@ -16,7 +16,7 @@ Step-out is detected as well, see step_out.py.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated
 
@@ -106,7 +106,8 @@ class HealthMonitor:
         }
         active = previous.alarm.split("; ")
         alarms = [name for name, level in levels.items() if level > (self.ends_at if name in active else 1.0)]
-        now = Health(
+        now = replace(
+            previous,
             stamp_ns=estimate.stamp_ns,
             alarm="; ".join(alarms),
             nis=nis,
@@ -123,7 +124,7 @@ class HealthMonitor:
         )
         if applied is None:
             return now
-        return self.step_out.watch(previous, now, before, estimate, applied, field, robot, wall_um)
+        return self.step_out.watch(now, before, estimate, applied, field, robot, wall_um)
 
     def _resonate(
         self, z: Resonators, power: Floats, deviation: float, dt: float, time_s: float

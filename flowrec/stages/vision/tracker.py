@@ -208,14 +208,13 @@ class Tracker:
         """Find a robot of unknown look; its appearance is None until it is seen."""
         frame, assumed = scene.frame, self.polarity or "dark"
         search = self._plan(scene, everywhere=True)
-        if self.click_px is not None or self.box_px is not None:
+        at_px = self.click_px if self.box_px is None else box_of(self.box_px)[0]
+        if at_px is not None:
             if self.click_frame is not None and frame.index < self.click_frame:
                 return scene.track(search, None), None
-            at_px, what = self.click_px, f"tracker.click_px = {list(self.click_px or ())}"
-            if self.box_px is not None:
-                at_px, what = box_of(self.box_px)[0], f"tracker.box_px = {list(self.box_px)}"
-            assert at_px is not None
-            return self._learn_look(scene, search, at_px, assumed, f"{what} of image {frame.index}")
+            name, given = ("click_px", at_px) if self.box_px is None else ("box_px", self.box_px)
+            what = f"tracker.{name} = {list(given)} of image {frame.index}"
+            return self._learn_look(scene, search, at_px, assumed, what)
         noise = pixel_noise(frame.image)
         dark = self._dark_disc(scene, search, noise) if assumed != "bright" else None
         if assumed != "dark":
