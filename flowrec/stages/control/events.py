@@ -119,7 +119,8 @@ def _health(before: Health | None, health: Health | None) -> Iterator[Line]:
     """Alarms that began or ended, and a frequency limit that was lowered because of step-out, or lifted."""
     if health is None or health is before:
         return
-    was, now = (set(alarm.split("; ")) - {""} for alarm in ("" if before is None else before.alarm, health.alarm))
+    was = set() if before is None else set(before.alarm.split("; ")) - {""}
+    now = set(health.alarm.split("; ")) - {""}
     texts: dict[str, str] = {
         Alarm.NIS: f"the robot is moved by what the observer does not know (NIS {health.nis:.1f}, should be 2)",
         Alarm.PULSATION: f"the flow pulsates at {health.pulsation_hz:.2g} Hz by {health.pulsation_share:.0%}",
