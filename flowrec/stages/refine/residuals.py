@@ -64,7 +64,7 @@ class Physics:
         """
         vx, vy = velocity[:, :1], velocity[:, 1:]
         right, left, below, above = self.solid
-        slopes = self._slopes(velocity)
+        slopes = [(self._slope(v, 0, right, left), self._slope(v, 1, below, above)) for v in (vx, vy)]
         equations = [slopes[0][0] + slopes[1][1]]
         gradient = (self._one_sided(pressure, 0, right, left), self._one_sided(pressure, 1, below, above))
         walls = right + left + below + above
@@ -80,7 +80,10 @@ class Physics:
         """(n, 1, h, w) viscosity at the shear rate of a velocity (n, 2, h, w), 0 in solid; None if it is constant."""
         if self.viscosity is None:
             return None
-        return self._local_viscosity(velocity, self._slopes(velocity))
+        right, left, below, above = self.solid
+        components = velocity[:, :1], velocity[:, 1:]
+        slopes = [(self._slope(v, 0, right, left), self._slope(v, 1, below, above)) for v in components]
+        return self._local_viscosity(velocity, slopes)
 
     def _local_viscosity(self, velocity: Tensor, slopes: list[tuple[Tensor, Tensor]]) -> Tensor:
         """Viscosity from the derivatives of both components; its gradient is that of the law."""
@@ -118,17 +121,9 @@ class Physics:
             equations.append(inertia + push - viscous - extra + self.friction * m * v)
         return torch.cat(equations, dim=1) * self.where
 
-    def _slopes(self, velocity: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Central differences along x and y of both components of a velocity that is 0 in solid, -v beyond a wall."""
-        right, left, below, above = self.solid
-        x, y, _ = self.kernels
-        return [
-            (
-                functional.conv2d(v, x, padding=1) + 0.5 * (left - right) * v,
-                functional.conv2d(v, y, padding=1) + 0.5 * (above - below) * v,
-            )
-            for v in (velocity[:, :1], velocity[:, 1:])
-        ]
+    def _slope(self, v: Tensor, axis: int, after: Tensor, before: Tensor) -> Tensor:
+        """Central difference of a velocity that is 0 in solid, with -v beyond a wall."""
+        return functional.conv2d(v, self.kernels[axis], padding=1) + 0.5 * (before - after) * v
 
     def _one_sided(self, p: Tensor, axis: int, after: Tensor, before: Tensor) -> Tensor:
         """Central difference of a pressure that is 0 in solid, one-sided beside a wall."""
