@@ -209,7 +209,7 @@ class MissionStateMachine:
         if mission.wanted == WorkOrder.REFINE:
             return now.finish(Outcome.OBSERVE_COMPLETE)
         if not mission.input_ended:
-            return now.changed(wanted="") if mission.wanted else mission
+            return now.with_changes(wanted="") if mission.wanted else mission
         if now.track.seen_ns is None:
             return now.finish(Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {IN_VIEW}"))
         return now.order(Phase.OBSERVE, WorkOrder.REFINE)
@@ -228,11 +228,11 @@ class MissionStateMachine:
             return with_goal(now)
         if command == Action.SPEED:
             assert now.operator is not None
-            return now.changed(speed_limit_um_s=now.operator.speed_limit_um_s, speed_set_ns=now.now_ns)
+            return now.with_changes(speed_limit_um_s=now.operator.speed_limit_um_s, speed_set_ns=now.now_ns)
         if command == Action.PAUSE and since_ns is None:
-            return now.changed(held_since_ns=now.now_ns)
+            return now.with_changes(held_since_ns=now.now_ns)
         if command == Action.RESUME and since_ns is not None:
-            return now.changed(held_since_ns=None, held_ns=mission.held_ns + now.now_ns - since_ns, swept=False)
+            return now.with_changes(held_since_ns=None, held_ns=mission.held_ns + now.now_ns - since_ns, swept=False)
         return mission
 
     def _advance(self, now: MissionFrame) -> Mission:
@@ -257,7 +257,7 @@ class MissionStateMachine:
                 return now.transition(Phase.SURVEY, result.reason)
             return self._next_phase(Phase.SURVEY, now, f"no survey: {result.reason}")
         if not now.track.seen:
-            return now.changed(wanted="") if now.mission.wanted else now.mission
+            return now.with_changes(wanted="") if now.mission.wanted else now.mission
         if self.hold_start_s is not None and now.elapsed_s() < self.hold_start_s:
             return now.mission
         if Phase.SURVEY in self.phases:
@@ -276,7 +276,7 @@ class MissionStateMachine:
             return now.routine_order(Phase.PLAN, now.mission.note)
         if mission.speed_limit_um_s is not None:  # a person must change that
             note = f"no route at {mission.speed_limit_um_s:g} um/s: {result.reason}; set another speed limit or goal"
-            return now.changed(wanted="", held_since_ns=now.now_ns, note=f"{note}, then go on")
+            return now.with_changes(wanted="", held_since_ns=now.now_ns, note=f"{note}, then go on")
         return now.finish(Outcome.UNREACHABLE, result.reason)
 
     def _survey(self, now: MissionFrame, route: Route) -> Mission:
@@ -344,7 +344,7 @@ class MissionStateMachine:
             if not self.wait_at_goal_s:
                 return now.finish(Outcome.REACHED)
             note = f"at the goal: waits {self.wait_at_goal_s:g} s for another one"
-            return now.changed(arrived_s=now.elapsed_s(), note=note)
+            return now.with_changes(arrived_s=now.elapsed_s(), note=note)
         if arrived_s is not None and now.elapsed_s() - arrived_s >= self.wait_at_goal_s:
             return now.finish(Outcome.REACHED)
         limit_s = self._time_limit_s(self.navigate_limit_s, route, mission.goal_from_s)

@@ -29,9 +29,11 @@ def with_goal(now: MissionFrame) -> Mission:
     if event is None or event.goal_um.shape != (2,):
         return mission
     if now.goal_fault:
-        return now.changed(note=f"goal {event.text} refused: {now.goal_fault}")
+        return now.with_changes(note=f"goal {event.text} refused: {now.goal_fault}")
     former_um = mission.former_goal_um if is_asked(mission) else mission.goal_um
-    return now.changed(goal_um=event.goal_um, former_goal_um=former_um, goal_set_ns=now.now_ns, arrived_s=None, note="")
+    return now.with_changes(
+        goal_um=event.goal_um, former_goal_um=former_um, goal_set_ns=now.now_ns, arrived_s=None, note=""
+    )
 
 
 def is_current(mission: Mission) -> bool:

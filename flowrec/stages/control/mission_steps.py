@@ -90,19 +90,21 @@ class MissionFrame:
         progress_s = self.demand.progress_s if self.demand is not None else 0.0
         return float(route.arrival_s[-1]) - progress_s
 
-    def changed(self, **changes: Any) -> Mission:
+    def with_changes(self, **changes: Any) -> Mission:
         """The mission with other values from now on."""
         return replace(self.mission, stamp_ns=self.now_ns, **changes)
 
     def going_on(self, **changes: Any) -> MissionFrame:
         """The frame on which the mission has other values already."""
-        return replace(self, mission=self.changed(**changes))
+        return replace(self, mission=self.with_changes(**changes))
 
     def transition(self, phase: Phase, note: str = "", wanted: WorkOrder | None = None, **changes: Any) -> Mission:
         """The mission in a phase, which begins now unless it is the present one."""
         if phase != self.mission.phase:
             changes = {"since_ns": self.now_ns, "held_ns": 0, "goal_from_s": 0.0, "arrived_s": None} | changes
-        return self.changed(phase=phase.value, wanted=wanted.value if wanted is not None else "", note=note, **changes)
+        return self.with_changes(
+            phase=phase.value, wanted=wanted.value if wanted is not None else "", note=note, **changes
+        )
 
     def order(self, phase: Phase, wanted: WorkOrder, note: str = "", **changes: Any) -> Mission:
         """The mission in a phase that waits for a new work order, whose route begins at the robot unless stated."""
@@ -148,7 +150,7 @@ def note_swept(now: MissionFrame) -> Mission:
         return mission
     limit_radii = _RETURNED_RADII if mission.swept else _SWEPT_RADII
     swept = now.demand.error_um > limit_radii * now.robot.radius_um
-    return mission if swept == mission.swept else now.changed(swept=swept)
+    return mission if swept == mission.swept else now.with_changes(swept=swept)
 
 
 def end_if_lost(now: MissionFrame, find_limit_s: float, lost_limit_frames: int) -> Mission | None:
@@ -184,7 +186,7 @@ def without_sight(now: MissionFrame, hold_after_s: float, zero_after_s: float, f
     if applied is None or seen_ns is None or applied.image_since_ns is None:  # never seen yet, or an older session
         return mission
     if now.track.seen:
-        return mission if blind_ns is None else now.changed(blind_since_ns=None, blind="", field_off=False)
+        return mission if blind_ns is None else now.with_changes(blind_since_ns=None, blind="", field_off=False)
     absent_ns = applied.absent_until_ns
     unseen_s = seconds(now.now_ns - (seen_ns if absent_ns is None else max(seen_ns, absent_ns)))
     why = f"robot not seen since {seconds(seen_ns):.1f} s"
@@ -196,7 +198,7 @@ def without_sight(now: MissionFrame, hold_after_s: float, zero_after_s: float, f
         return now.finish(Outcome.LOST, why)
     since_ns = now.now_ns if blind_ns is None else blind_ns
     if (applied.without_image or unseen_s >= zero_after_s) and not mission.field_off:
-        return now.changed(blind_since_ns=since_ns, blind=why, field_off=True)
+        return now.with_changes(blind_since_ns=since_ns, blind=why, field_off=True)
     if not applied.without_image and unseen_s >= hold_after_s and blind_ns is None:
-        return now.changed(blind_since_ns=since_ns, blind=why)
+        return now.with_changes(blind_since_ns=since_ns, blind=why)
     return mission

@@ -122,9 +122,7 @@ class HealthMonitor:
             mean_um_s=mean,
             offset_share=offset,
         )
-        if applied is None:
-            return now
-        return self.step_out.watch(now, before, estimate, applied, field, robot, wall_um)
+        return now if applied is None else self.step_out.watch(now, before, estimate, applied, field, robot, wall_um)
 
     def _resonate(
         self, z: Resonators, power: Floats, deviation: float, dt: float, time_s: float
