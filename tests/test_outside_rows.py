@@ -24,7 +24,7 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.stages.config import Config, config_from_toml, load_config, with_sets
 from flowrec.stages.control.controller import CONTROLLERS
 from flowrec.stages.control.field_rotation import FieldCommand
-from flowrec.stages.control.tracking_laws import Reference, Situation, TrackingLaw, Vector, VectorLaw
+from flowrec.stages.control.tracking_laws import Reference, Situation, TrackingLaw, VectorLaw
 from flowrec.stages.estimation.kalman import Kalman
 from flowrec.stages.estimation.observer import OBSERVERS, Observer
 from flowrec.stages.outside_settings import with_row
@@ -119,7 +119,7 @@ class LabController(TrackingLaw):
 
     per_s: Annotated[float, Range(0.0, 100.0)] = 3.0
 
-    def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
+    def velocity(self, now: Situation, reference: Reference) -> tuple[np.ndarray, bool]:
         return VectorLaw(self.per_s).velocity(now, reference)
 
 

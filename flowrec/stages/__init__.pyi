@@ -21,8 +21,7 @@ from .control.motion_axes import (
 )
 from .estimation.consistency_monitor import HealthMonitor as HealthMonitor
 from .estimation.kalman import Kalman as Kalman, memory_s as memory_s
-from .estimation.luenberger import Luenberger as Luenberger
-from .estimation.observer import OBSERVERS as OBSERVERS, Observer as Observer
+from .estimation.observer import Luenberger as Luenberger, OBSERVERS as OBSERVERS, Observer as Observer
 from .estimation.sampler import SAMPLERS as SAMPLERS, Trimmed as Trimmed
 from .estimation.smoother import observe as observe, smooth as smooth
 from .estimation.whitening import (
@@ -75,8 +74,9 @@ from .run_figures import (
 from .simulated_settings import (
     Optics as Optics, Simulated as Simulated, SimulatedImage as SimulatedImage,
 )
-from .vision.bodies import (
-    MOST as MOST, View as View, bodies_like as bodies_like, bodies_that_stand_out as bodies_that_stand_out,
+from .vision.learned import View as View
+from .vision.learning import (
+    MOST as MOST, bodies_like as bodies_like, bodies_that_stand_out as bodies_that_stand_out,
 )
 from .vision.track_quality import TrackQuality as TrackQuality
 from .vision.tracker import Tracker as Tracker

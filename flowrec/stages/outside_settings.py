@@ -197,11 +197,16 @@ def our_class(config: Any) -> Any:
     return (arguments_of(type(config)) or (type(config),))[0]
 
 
+def _holder(config: Any, section: str) -> Any:
+    """The settings of a section; '' is the whole configuration."""
+    return getattr(config, section) if section else config
+
+
 def sections(config: Any) -> Iterator[Section]:
     """The sections of others in a configuration."""
     for setting, table in tables(our_class(config)):
         section = setting.rpartition(".")[0]
-        holder = getattr(config, section) if section else config
+        holder = _holder(config, section)
         ours = {each.name for each in fields(our_class(holder))}
         for each in fields(holder):
             settings = getattr(holder, each.name)
@@ -214,9 +219,7 @@ def of_stages(config: Any) -> Iterator[Section]:
     """The sections, as `sections` gives them, whose rows the stages of a run use; devices and inputs are no stages."""
     for setting, table, name, settings in sections(config):
         section, _, selector = setting.rpartition(".")
-        if table.makes_objects or name not in _names(
-            getattr(getattr(config, section) if section else config, selector)
-        ):
+        if table.makes_objects or name not in _names(getattr(_holder(config, section), selector)):
             continue
         if isinstance(settings, dict) or _source_of(settings) in (None, Source.STAGE.name):
             yield setting, table, name, settings

@@ -26,6 +26,7 @@ from flowrec.core import (
     Estimate,
     Extra,
     Fit,
+    Floats,
     FlowField,
     Frame,
     Message,
@@ -147,7 +148,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     )
 
 
-def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
+def _wall_um(p: Pipeline, point_um: Floats) -> float:
     """Distance from a point (2,) to the nearest wall, at the nearest pixel; 0 if the point is not finite."""
     if not np.isfinite(point_um).all():
         return 0.0
@@ -218,7 +219,7 @@ def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
     return sight._replace(track=replace(track, seen_ns=track.stamp_ns if track.seen else before_ns))
 
 
-def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track) -> tuple[AxesCheck | None, NDArray[np.float64] | None]:
+def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track) -> tuple[AxesCheck | None, Floats | None]:
     """The check of the axes, and the velocity (2,) that it drives the robot with; None: the robot is controlled."""
     mission = last.mission
     checks = p.mission.check_axes and not p.mission.observes

@@ -37,6 +37,8 @@ AMPLIFIERS = Methods(
     verb="of",
 )
 _Rate = Annotated[float, Range(0.1, 5e3)]
+_Side = Annotated[int, Range(8, 16_384)]
+_Bits = Annotated[int, OneOf(8, 10, 12, 14, 16)]
 _Scale = Annotated[float, Range(1e-3, 1e3)]
 Angle = Annotated[float, Range(-360.0, 360.0)]
 _Coordinate = Annotated[float, Range(-1e7, 1e7)]
@@ -50,9 +52,9 @@ PointUm = tuple[_Coordinate, _Coordinate]
 class CameraSettings:
     """Section [camera] of a configuration. None: chosen when the configuration is resolved."""
 
-    width_px: Annotated[int, Range(8, 16_384)] = 640
-    height_px: Annotated[int, Range(8, 16_384)] = 512
-    bits: Annotated[int, OneOf(8, 10, 12, 14, 16)] = 8  # depth of a pixel; grey levels are below 2^bits
+    width_px: _Side = 640
+    height_px: _Side = 512
+    bits: _Bits = 8  # depth of a pixel; grey levels are below 2^bits
     rate_hz: _Rate | None = None  # None: chosen to fit the robot's speed
     um_per_px: _Scale | None = None  # None: the whole chip fills the image
     # Registration: how the chip lies in the image, and um_per_px. flowrec calibrate image measures them and writes a
@@ -113,7 +115,7 @@ class MovieSettings:
     path: str = ""  # of a file, or of a folder of images
     reader: Annotated[str, MOVIE_READERS] | None = None  # None: by the content of the file
     channel: Literal["red", "green", "blue", "grey"] | None = None  # what is used of a movie in colour
-    bits: Annotated[int, OneOf(8, 10, 12, 14, 16)] | None = None  # depth of the pixels, where the file does not tell it
+    bits: _Bits | None = None  # depth of the pixels, where the file does not tell it
     partial: bool = False  # a movie that breaks off is used up to there
     times: str = ""  # CSV with a column time_s, a row for each image; '': as the movie tells
     rate_hz: Annotated[float, Range(1e-4, 1e6)] | None = None  # of the images, instead of their times

@@ -19,6 +19,7 @@ from flowrec.stages.rig_settings import Angle, PointUm
 Optics = Literal["disc", "oblique"]
 _Size = Annotated[float, Range(0.0, 10.0)]
 _PartOf = Annotated[float, Range(0.0, 0.99)]
+_TrueOverAssumed = Annotated[float, Range(0.01, 10.0)]
 _Rate = Annotated[float, Range(0.0, 1e3)]
 
 # The world of every session that was recorded before there was more than one.
@@ -51,7 +52,7 @@ class Simulated:
     # The flow.
     # each true inlet speed is the assumed one times 1 +- (a third of this to all)
     inlet_speed_error: _PartOf | None = None
-    inlet_speed_share: Annotated[float, Range(0.01, 10.0)] | None = None  # true over assumed, of all; None: drawn
+    inlet_speed_share: _TrueOverAssumed | None = None  # true over assumed, of all; None: drawn
     # each true outlet pressure differs by up to this fraction of the chip's pressure drop
     outlet_pressure_error: _Size | None = None
     viscosity_error: _PartOf | None = None  # the true viscosity is the assumed one times up to 1 +- this
@@ -74,7 +75,7 @@ class Simulated:
     k: Annotated[int, OneOf(1, 2, 4)] | None = None  # cells of the true flow per pixel side of the true walls' mask
     # The robot.
     um_per_rev_error: _PartOf | None = None  # true um per revolution: the assumed one times up to 1 +- this
-    um_per_rev_share: Annotated[float, Range(0.01, 10.0)] | None = None  # true over assumed; None: drawn
+    um_per_rev_share: _TrueOverAssumed | None = None  # true over assumed; None: drawn
     slip: _PartOf | None = None  # fraction of the rolled distance that is lost; alone it is a smaller um per revolution
     # Drag of the side walls: 0 none, 1 as for a sphere (rigs/simulated/hindrance.py), on its own motion and on how the
     # flow carries it.
@@ -88,7 +89,7 @@ class Simulated:
     delay_error: _PartOf | None = None  # from command to motion: the robot's delay as assumed times up to 1 +- this
     delay_s: Annotated[float, Range(0.0, 10.0)] | None = None  # None: drawn
     step_out_error: _PartOf | None = None  # the true step-out frequency is the assumed one times up to 1 +- this
-    step_out_share: Annotated[float, Range(0.01, 10.0)] | None = None  # true over assumed; None: drawn
+    step_out_share: _TrueOverAssumed | None = None  # true over assumed; None: drawn
     # each coil's true field per ampere differs by up to this fraction of itself, in each of the three directions
     coil_error: _PartOf | None = None
     # The camera.

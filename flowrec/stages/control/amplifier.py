@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Range
+from flowrec.core import Floats, Range
 
-Vector = NDArray[np.float64]
 PerCoil = tuple[float, float, float]  # one number for each coil: x, y, z
 WORST_CONDITION = 1e3  # largest condition number of the matrix mt_per_a that is accepted
 _TURN_RAD = 2.0 * math.pi
@@ -36,20 +34,20 @@ class AmplifierSettings:
     output_hz: Annotated[float, Range(100.0, 1e7)] = 20_000.0  # samples per second of each output
 
     @property
-    def ohm(self) -> Vector:
+    def ohm(self) -> Floats:
         """(3,) output volts per ampere of constant current."""
         if self.kind == "current":
             return np.divide(1.0, self.a_per_v)
         return np.divide(self.resistance_ohm, self.v_per_v)
 
     @property
-    def henry(self) -> Vector:
+    def henry(self) -> Floats:
         """(3,) output volts per ampere per second."""
         if self.kind == "current":
             return np.zeros(3)
         return np.divide(self.inductance_mh, self.v_per_v) * _H_PER_MH
 
-    def sample_and_hold_v(self, currents_a: Vector, step_s: float) -> Vector:
+    def sample_and_hold_v(self, currents_a: Floats, step_s: float) -> Floats:
         """Voltages (n, 3), each held for one step, that produce the currents (n + 1, 3) at the samples.
 
         Exact for V = R i + L di/dt with V constant over a step: i' = a i + (1 - a) V / R with a = exp(-R step / L).
@@ -75,14 +73,14 @@ class FieldLimits:
     |row c of A^-1| b amperes and |row c of A^-1| b |R + j w L| volts at coil c, when it points along that row.
     """
 
-    inverse: Vector  # (3, 3) A^-1, A per mT
-    bias_a: Vector  # (3,) currents that would produce the bias field; their negative compensates it
-    row_a_per_mt: Vector  # (3,) norms of the rows of A^-1
-    a_per_mt_ramp: Vector  # (3,) A/s per mT/s while the amplitude ramps, and the bias compensation with it
-    available_a: Vector  # (3,) current left for the rotating field after bias compensation
-    available_v: Vector  # (3,) voltage left for the rotating field after bias compensation and ramp
-    ohm: Vector  # (3,)
-    henry: Vector  # (3,)
+    inverse: Floats  # (3, 3) A^-1, A per mT
+    bias_a: Floats  # (3,) currents that would produce the bias field; their negative compensates it
+    row_a_per_mt: Floats  # (3,) norms of the rows of A^-1
+    a_per_mt_ramp: Floats  # (3,) A/s per mT/s while the amplitude ramps, and the bias compensation with it
+    available_a: Floats  # (3,) current left for the rotating field after bias compensation
+    available_v: Floats  # (3,) voltage left for the rotating field after bias compensation and ramp
+    ohm: Floats  # (3,)
+    henry: Floats  # (3,)
     nominal_mt: float  # amplitude that the settings ask for
 
     def max_amplitude_mt(self, frequency_hz: float) -> float:
@@ -109,7 +107,7 @@ class FieldLimits:
         return max(min(static_mt, self.nominal_mt * float(f.min()) / follow_hz), 0.0)
 
 
-def direction_name(direction: Vector) -> str:
+def direction_name(direction: Floats) -> str:
     """A direction (3,) as text: x, or (0.71, 0.00, -0.71)."""
     largest = int(np.argmax(np.abs(direction)))
     if abs(direction[largest]) > 0.98:

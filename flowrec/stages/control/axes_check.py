@@ -13,9 +13,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Applied, AxesCheck, AxesVerdict, Track, seconds
+from flowrec.core import Applied, AxesCheck, AxesVerdict, Floats, Track, seconds
 from flowrec.physics import Calibration, Robot
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.control.motion_axes import MotionVerdict, coil_settings, contradiction, orientation_by_motion
@@ -42,7 +41,7 @@ def watch(
     track: Track,
     applied: Applied,
     robot: Robot,
-    map_um_s: NDArray[np.float64],
+    map_um_s: Floats,
     wall_um: float,
     frame_s: float,
     stated: Calibration,
@@ -78,12 +77,12 @@ def watch(
     return _round(judged, track, robot, wall_um, frame_s) if over and leg == len(_WAYS) - 1 else now
 
 
-def steady_velocity(axes: AxesCheck | None, map_um_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def steady_velocity(axes: AxesCheck | None, map_um_s: Floats) -> Floats:
     """(2,) velocity demanded against the flow: as the last round tells, or by the map, `map_um_s` (2,)."""
     return -map_um_s if axes is None or not len(axes.against_um_s) else axes.against_um_s
 
 
-def leg_velocity(axes: AxesCheck | None) -> NDArray[np.float64]:
+def leg_velocity(axes: AxesCheck | None) -> Floats:
     """(2,) velocity that the present leg demands; 0 before the first one."""
     if axes is None or axes.verdict:
         return np.zeros(2)
@@ -119,7 +118,7 @@ def _round(before: AxesCheck | None, track: Track, robot: Robot, wall_um: float,
 
 
 def _with_position(
-    before: AxesCheck, track: Track, applied: Applied, robot: Robot, steady_um_s: NDArray[np.float64], dt_s: float
+    before: AxesCheck, track: Track, applied: Applied, robot: Robot, steady_um_s: Floats, dt_s: float
 ) -> AxesCheck:
     """The sums with one more position."""
     own_um = before.own_um + robot.um_per_rev * applied.turns
@@ -165,7 +164,7 @@ def _judge(now: AxesCheck, stated: Calibration, coils: Coils, *, last: bool) -> 
     return replace(now, verdict=said.verdict.value, text=_text(said, now, stated, coils))
 
 
-def _fit(now: AxesCheck) -> tuple[NDArray[np.float64], float, NDArray[np.float64]] | None:
+def _fit(now: AxesCheck) -> tuple[Floats, float, Floats] | None:
     """Gain (2, 2), standard deviation of its elements and mean flow (2,) as seen, of a round; None: not determined."""
     size = np.sqrt(np.diag(now.normal))
     if not (size > 0.0).all():

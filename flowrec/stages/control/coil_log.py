@@ -21,9 +21,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import DATES, NS_PER_S, TIME_UNITS, MovieError, Table, read_table
+from flowrec.core import DATES, NS_PER_S, TIME_UNITS, Floats, MovieError, Table, read_table
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.control.field_log import FieldLog
 from flowrec.stages.rig_settings import Column, Columns
@@ -37,8 +36,6 @@ _TURNS = ("turns_x", "turns_y", "amplitude_mt")
 _KINDS = (_TURNS, _ROTATING, _IN_RADIANS, _FIELDS, _CURRENTS)
 _LARGEST_STEP_RAD = 2.0 * math.pi / 3.0
 _OFF = 0.05  # of the largest amplitude: below it a sampled field is noise, and has no direction
-
-Vector = NDArray[np.float64]
 
 
 def read_coil_log(
@@ -69,7 +66,7 @@ def read_coil_log(
             "runs in one file, or a clock that was set? Split or sort it"
         )
     values = [_values(table, columns, name) for name in kind]
-    currents: Vector | None = None
+    currents: Floats | None = None
     if kind == _TURNS:
         frequency, heading, amplitude = _of_turns(times_s, *values)
     elif kind in (_ROTATING, _IN_RADIANS):
@@ -110,17 +107,24 @@ def _kind_of(table: Table, columns: Columns) -> tuple[str, str, str]:
     )
 
 
-def _of_turns(times_s: Vector, turns_x: Vector, turns_y: Vector, amplitude: Vector) -> tuple[Vector, Vector, Vector]:
+def _of_turns(times_s: Floats, turns_x: Floats, turns_y: Floats, amplitude: Floats) -> tuple[Floats, Floats, Floats]:
     """Mean frequency, heading and amplitude (n,) from each row to the next, which has the revolutions between the two.
 
     The field lasts where it turned, also if it is switched on or off between the two rows.
     """
-    frequency, heading, held = np.zeros(len(times_s)), np.zeros(len(times_s)), amplitude.copy()
-    lasts_s = np.diff(times_s)
-    frequency[:-1] = np.hypot(turns_x[1:], turns_y[1:]) / np.where(lasts_s > 0.0, lasts_s, np.inf)
-    heading[:-1] = np.arctan2(turns_y[1:], turns_x[1:])
+    frequency, heading = _from_turns(times_s, turns_x[1:], turns_y[1:])
+    held = amplitude.copy()
     held[:-1] = np.where(frequency[:-1] > 0.0, np.maximum(amplitude[:-1], amplitude[1:]), amplitude[:-1])
     return frequency, heading, held
+
+
+def _from_turns(times_s: Floats, along_x: Floats, along_y: Floats) -> tuple[Floats, Floats]:
+    """Frequency and heading (n,) of revolutions (n - 1,) from each row to the next; 0 from the last row on."""
+    lasts_s = np.diff(times_s)
+    frequency, heading = np.zeros(len(times_s)), np.zeros(len(times_s))
+    frequency[:-1] = np.hypot(along_x, along_y) / np.where(lasts_s > 0.0, lasts_s, np.inf)
+    heading[:-1] = np.arctan2(along_y, along_x)
+    return frequency, heading
 
 
 def is_of_session(path: Path) -> bool:
@@ -137,7 +141,7 @@ def _has(table: Table, columns: Columns, name: str) -> bool:
     return any(table.index(each) is not None for each in names)
 
 
-def _times_s(table: Table, columns: Columns) -> Vector:
+def _times_s(table: Table, columns: Columns) -> Floats:
     """Numbers or dates of the column that is named, or else of the first with times."""
     column = columns.time_s
     if column is not None and not isinstance(column, str):
@@ -153,7 +157,7 @@ def _name(column: Column | None) -> str:
     )
 
 
-def _values(table: Table, columns: Columns, name: str) -> Vector:
+def _values(table: Table, columns: Columns, name: str) -> Floats:
     column: Column | None = getattr(columns, name, None)
     if isinstance(column, (int, float)):
         return np.full(len(table.rows), float(column))
@@ -164,7 +168,7 @@ def _values(table: Table, columns: Columns, name: str) -> Vector:
     return values
 
 
-def _rotation(times_s: Vector, field_mt: Vector, coils: Coils, where: str) -> tuple[Vector, Vector, Vector]:
+def _rotation(times_s: Floats, field_mt: Floats, coils: Coils, where: str) -> tuple[Floats, Floats, Floats]:
     """Frequency, heading and amplitude (n,) of a sampled field (n, 3): the mean rotation from each row to the next."""
     amplitude = np.linalg.norm(field_mt, axis=1)
     on = amplitude > _OFF * amplitude.max()
@@ -183,8 +187,4 @@ def _rotation(times_s: Vector, field_mt: Vector, coils: Coils, where: str) -> tu
     along = np.column_stack([turns[:, 1], -turns[:, 0]]) if coils.mode == "roller" else turns[:, :2]
     reversed_ = coils.surface == "ceiling" if coils.mode == "roller" else coils.handedness == "left"
     along = -along if reversed_ else along
-    lasts_s = np.diff(times_s)
-    frequency, heading = np.zeros(len(times_s)), np.zeros(len(times_s))
-    frequency[:-1] = np.hypot(along[:, 0], along[:, 1]) / np.where(lasts_s > 0.0, lasts_s, np.inf)
-    heading[:-1] = np.arctan2(along[:, 1], along[:, 0])
-    return frequency, heading, np.where(on, amplitude, 0.0)
+    return *_from_turns(times_s, *along.T), np.where(on, amplitude, 0.0)

@@ -8,9 +8,9 @@ from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from flowrec.core import Currents, Demand, Range, UsageError, seconds
+from flowrec.core import Currents, Demand, Floats, Range, UsageError, seconds
 from flowrec.physics import Robot
 from flowrec.stages.control.amplifier import WORST_CONDITION, AmplifierSettings, FieldLimits, PerCoil, direction_name
 from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
@@ -60,7 +60,7 @@ class Coils:
             amplitude_mt = 0.0
         # The torque is proportional to the field, and so is the frequency up to which the robot follows it.
         limit_hz = follow_hz * min(amplitude_mt / self.amplitude_mt, 1.0)
-        speed_um_s = math.hypot(demand.velocity_um_s[0], demand.velocity_um_s[1])
+        speed_um_s = math.hypot(*demand.velocity_um_s)
         heading = previous.heading_rad if previous is not None else 0.0
         if speed_um_s > 1e-6:
             heading = math.atan2(demand.velocity_um_s[1], demand.velocity_um_s[0])
@@ -105,7 +105,7 @@ class Coils:
         state = FieldState(c.phase_rad, c.plane_rad, c.amplitude_mt)
         return state, FieldCommand(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz, self.ramp_mt_s)
 
-    def field_mt(self, phase_rad: ArrayLike, plane_rad: ArrayLike, amplitude_mt: ArrayLike) -> NDArray[np.float64]:
+    def field_mt(self, phase_rad: ArrayLike, plane_rad: ArrayLike, amplitude_mt: ArrayLike) -> Floats:
         """(..., 3) field for phases, planes and amplitudes of one shape (...), or that broadcast to it."""
         phase, plane, amplitude = np.broadcast_arrays(phase_rad, plane_rad, amplitude_mt)
         reversed_ = self.surface == "ceiling" if self.mode == "roller" else self.handedness == "left"
@@ -114,7 +114,7 @@ class Coils:
         x, y = (c, s) if self.mode == "roller" else (s, -c)
         return np.stack([horizontal * x, horizontal * y, amplitude * np.cos(phase)], -1)
 
-    def currents_a(self, field_mt: NDArray[np.float64], amplitude_mt: ArrayLike) -> NDArray[np.float64]:
+    def currents_a(self, field_mt: Floats, amplitude_mt: ArrayLike) -> Floats:
         """(..., 3) coil currents for a field (..., 3) of an amplitude (...): i = A^-1 (B - b).
 
         Below a tenth of the full amplitude the compensation of the bias b is reduced in proportion, so that zero field
@@ -122,12 +122,10 @@ class Coils:
         """
         limits = field_limits(self)
         weight = np.minimum(np.asarray(amplitude_mt) / self.fade_mt, 1.0)
-        currents: NDArray[np.float64] = field_mt @ limits.inverse.T - weight[..., None] * limits.bias_a
+        currents: Floats = field_mt @ limits.inverse.T - weight[..., None] * limits.bias_a
         return currents
 
-    def output_samples(
-        self, state: FieldState, command: FieldCommand, count: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def output_samples(self, state: FieldState, command: FieldCommand, count: int) -> tuple[Floats, Floats]:
         """Currents (count + 1, 3) at the output samples from now on, and the voltages (count, 3) held in between."""
         rate = self.amplifier.output_hz
         time, motion = np.arange(count + 1) / rate, field_motion(state, command)

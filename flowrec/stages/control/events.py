@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     Action,
     Alarm,
     AxesVerdict,
     Event,
+    Floats,
     FlowField,
     Health,
     Level,
@@ -25,6 +25,7 @@ from flowrec.core import (
     Tick,
     seconds,
 )
+from flowrec.stages.run_figures import length_um
 
 Line = tuple[str, Level | None]  # text and level; None leaves the level as it is
 # The mission reports other commands.
@@ -66,19 +67,14 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
         yield f"no route ({route.method}): {route.reason}", Level.WARNING
         return
     mission, before = tick.mission, last.mission
-    if mission is not None and before is not None and mission.phase == before.phase in (Phase.SURVEY, Phase.NAVIGATE):
-        yield f"{mission.phase}: {route.reason}", Level.WARNING if route.refused else None  # ordered on the way
-        return
-    if (
-        mission is not None
-        and before is not None
-        and mission.phase == before.phase
-        and mission.request != route.request
-    ):
-        yield "the route to an earlier goal, or at an earlier speed limit, is not taken", None
-        return
-    length = float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
-    yield f"route adopted ({route.method}): {length / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", None
+    if mission is not None and before is not None and mission.phase == before.phase:
+        if mission.phase in (Phase.SURVEY, Phase.NAVIGATE):  # ordered on the way
+            yield f"{mission.phase}: {route.reason}", Level.WARNING if route.refused else None
+            return
+        if mission.request != route.request:
+            yield "the route to an earlier goal, or at an earlier speed limit, is not taken", None
+            return
+    yield f"route adopted ({route.method}): {length_um(route) / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", None
     if needs_time_to_go and route.method != "survey" and route.time_to_go_s is None:
         yield "no time to go is known from here: the route is followed as by control.method = vector", Level.WARNING
 
@@ -179,7 +175,7 @@ def _steering(event: OperatorEvent, mission: Mission) -> Line:
     return f"operator: {why}", Level.WARNING
 
 
-def _place(point_um: NDArray[np.float64]) -> str:
+def _place(point_um: Floats) -> str:
     return f"{point_um[0]:.0f}, {point_um[1]:.0f} um"
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import NS_PER_S, Applied, nanoseconds, seconds
+from flowrec.core import NS_PER_S, Applied, Floats, nanoseconds, seconds
 from flowrec.stages.control.field_rotation import MotionSegment
 
 _COILS = 3  # where no row says otherwise
@@ -28,7 +28,7 @@ class FieldRow(NamedTuple):
     frequency_hz: float
     heading_rad: float  # direction in which the robot travels
     amplitude_mt: float
-    currents_a: NDArray[np.float64]  # (k,) of each coil, of three x, y, z; zeros if they are not known
+    currents_a: Floats  # (k,) of each coil, of three x, y, z; zeros if they are not known
 
 
 class FieldLog:
@@ -82,22 +82,22 @@ class FieldLog:
         return self._times_ns[: self._rows]
 
     @property
-    def frequency_hz(self) -> NDArray[np.float64]:
+    def frequency_hz(self) -> Floats:
         """(n,)"""
         return self._values[: self._rows, _FREQUENCY]
 
     @property
-    def heading_rad(self) -> NDArray[np.float64]:
+    def heading_rad(self) -> Floats:
         """(n,)"""
         return self._values[: self._rows, _HEADING]
 
     @property
-    def amplitude_mt(self) -> NDArray[np.float64]:
+    def amplitude_mt(self) -> Floats:
         """(n,)"""
         return self._values[: self._rows, _AMPLITUDE]
 
     @property
-    def currents_a(self) -> NDArray[np.float64]:
+    def currents_a(self) -> Floats:
         """(n, k)"""
         return self._values[: self._rows, _CURRENTS]
 
@@ -160,7 +160,7 @@ class FieldLog:
         frequency_hz, heading_rad, amplitude_mt = values[: _CURRENTS.start].tolist()
         return FieldRow(frequency_hz, heading_rad, amplitude_mt, values[_CURRENTS].copy())
 
-    def turns_until(self, stamps_ns: ArrayLike) -> NDArray[np.float64]:
+    def turns_until(self, stamps_ns: ArrayLike) -> Floats:
         """(..., 2) revolutions along x and y from the first row to stamps (...): the integral of f (cos, sin) dt.
 
         Time without amplitude does not count. Stamps may be fractions of a ns.
@@ -170,13 +170,13 @@ class FieldLog:
             return np.zeros((*stamps.shape, 2))
         row = np.maximum(np.searchsorted(self.times_ns, stamps, "right") - 1, 0)
         since_s = np.maximum(stamps - self._times_ns[row], 0) / NS_PER_S
-        result: NDArray[np.float64] = self._turns[row] + self._rates(row) * since_s[..., None]
+        result: Floats = self._turns[row] + self._rates(row) * since_s[..., None]
         return result
 
-    def turns(self, from_ns: int, to_ns: int) -> NDArray[np.float64]:
+    def turns(self, from_ns: int, to_ns: int) -> Floats:
         """(2,) revolutions along x and y between two stamps; see `turns_until`."""
         begin, end = self.turns_until(np.array([from_ns, to_ns], np.int64))
-        difference: NDArray[np.float64] = end - begin
+        difference: Floats = end - begin
         return difference
 
     def applied_at(self, stamp_ns: int, before_ns: int | None) -> Applied:
@@ -205,7 +205,7 @@ class FieldLog:
         amplitude = np.where(turns > 0.0, np.interp(middle, rows, self.amplitude_mt), self.amplitude_mt[held])
         return type(self)(times, turns, np.arctan2(across, along), amplitude, self.currents_a[held])
 
-    def _rates(self, rows: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+    def _rates(self, rows: slice | NDArray[np.int64]) -> Floats:
         """(..., 2) revolutions per second along x and y; zero without amplitude."""
         values = self._values[rows]
         frequency = np.where(values[..., _AMPLITUDE] > 0.0, values[..., _FREQUENCY], 0.0)

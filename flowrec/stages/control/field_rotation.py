@@ -20,9 +20,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from flowrec.core import wrap_rad
+from flowrec.core import Floats, wrap_rad
 
 _TURN_RAD = 2.0 * math.pi
 _VERTICAL_RAD = 1e-9  # within this angle of the axis z the field counts as vertical
@@ -72,16 +72,16 @@ class FieldMotion:
     slew_s: float  # duration of the turn: until it is complete or the field is vertical
     plane_end_rad: float
 
-    def phase(self, time_s: ArrayLike) -> NDArray[np.float64]:
+    def phase(self, time_s: ArrayLike) -> Floats:
         """Theta in rad, unbounded; shape of `time_s`."""
         return self.phase_rad + self.direction * _TURN_RAD * self.command.frequency_hz * np.asarray(time_s, np.float64)
 
-    def plane(self, time_s: ArrayLike) -> NDArray[np.float64]:
+    def plane(self, time_s: ArrayLike) -> Floats:
         """Heading of the plane in rad; shape of `time_s`."""
         time = np.asarray(time_s, np.float64)
         return np.where(time < self.slew_s, self.plane_rad + self.slew_rad_s * time, self.plane_end_rad)
 
-    def amplitude(self, time_s: ArrayLike) -> NDArray[np.float64]:
+    def amplitude(self, time_s: ArrayLike) -> Floats:
         """In mT; shape of `time_s`."""
         time, change = np.asarray(time_s, np.float64), self.command.amplitude_mt - self.amplitude_mt
         if math.isinf(self.command.ramp_mt_s) or change == 0.0:

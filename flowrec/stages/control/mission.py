@@ -34,26 +34,13 @@ from flowrec.core import (
 from flowrec.physics import Robot
 from flowrec.stages.control.mission_goals import (
     confirm_goal,
-    held_without_route,
     is_asked,
     is_current,
     on_the_way,
     refuse_goal,
-    routine_order,
     with_goal,
-    with_speed_limit,
 )
-from flowrec.stages.control.mission_sight import IN_VIEW, end_if_lost, without_sight
-from flowrec.stages.control.mission_steps import (
-    MissionInputs,
-    at_end,
-    elapsed_s,
-    finish,
-    left_s,
-    note_swept,
-    order,
-    transition,
-)
+from flowrec.stages.control.mission_steps import IN_VIEW, MissionFrame, end_if_lost, note_swept, without_sight
 from flowrec.stages.control.trajectory import position_at
 
 PhaseName = Literal[Phase.SURVEY, Phase.REFINE, Phase.PLAN, Phase.NAVIGATE, Phase.OBSERVE]
@@ -149,57 +136,54 @@ class MissionStateMachine:
         `goal_fault` says why the goal of `operator` can be none: it is in a wall, or outside the chip. `axes` is the
         check of the axes; while `checking` is under way or due the mission stays at its start.
         """
-        now = MissionInputs(
+        now = MissionFrame(
+            self._first(track.stamp_ns, assumed) if previous is None else previous,
             *(track, estimate, assumed, refined, route, operator, demand, robot, applied, not_found_note, refused),
             *(observations, goal_fault),
         )
         if self.observes:
-            return self._observe(previous if previous is not None else self._first(now), now)
-        if previous is None:
-            return self._after_command(self._first(now), now)
-        if previous.finished:
-            return previous
-        commanded = self._after_command(previous, now)
-        if commanded.finished:
+            return self._observe(now)
+        commanded = now.mission if now.mission.finished else self._after_command(now)
+        if previous is None or commanded.finished:
             return commanded
         if commanded.speed_limit_um_s is not None:
             now = replace(now, robot=robot.slowed_to(commanded.speed_limit_um_s))
         if now.command in _STEERING:
-            previous = commanded  # and goes on: a person who drags the goal stops nothing
-        ended = end_if_lost(previous, now, self.find_limit_s, self.lost_limit_frames)
+            now = replace(now, mission=commanded)  # and goes on: a person who drags the goal stops nothing
+        mission = now.mission
+        ended = end_if_lost(now, self.find_limit_s, self.lost_limit_frames)
         if ended is not None:
             return ended
-        if commanded is not previous:
+        if commanded is not mission:
             return commanded
-        unseen = without_sight(previous, now, self.hold_after_s, self.zero_after_s, self.find_limit_s)
-        if unseen is not previous or previous.blind_since_ns is not None:
+        unseen = without_sight(now, self.hold_after_s, self.zero_after_s, self.find_limit_s)
+        if unseen is not mission or mission.blind_since_ns is not None:
             return unseen
-        if previous.held_since_ns is not None:
-            return note_swept(previous, now)
+        if mission.held_since_ns is not None:
+            return note_swept(now)
         if checking:
-            return previous
+            return mission
         refuted = axes is not None and axes.verdict in (AxesVerdict.CONTRADICTS, AxesVerdict.NO_MOTION)
-        if axes is not None and refuted and previous.phase == Phase.START:
-            return finish(previous, now, Outcome.REFUSED, axes.text)
-        result = now.result(previous)
-        waits = bool(previous.wanted) and result is None and previous.phase not in _ON_THE_WAY
-        return previous if waits else self._advance(previous, now, result)
+        if axes is not None and refuted and mission.phase == Phase.START:
+            return now.finish(Outcome.REFUSED, axes.text)
+        waits = mission.wanted and mission.phase not in _ON_THE_WAY and now.result() is None
+        return mission if waits else self._advance(now)
 
     @property
     def observes(self) -> bool:
         """True if the robot is only watched."""
         return Phase.OBSERVE in self.phases
 
-    def _first(self, now: MissionInputs) -> Mission:
-        has_field = now.assumed is not None  # of an earlier session
+    def _first(self, now_ns: int, assumed: FlowField | None) -> Mission:
+        has_field = assumed is not None  # of an earlier session
         nowhere = np.full(2, np.nan)
         return Mission(
-            stamp_ns=now.now_ns,
+            stamp_ns=now_ns,
             phase=Phase.OBSERVE.value if self.observes else Phase.START.value,
-            since_ns=now.now_ns,
+            since_ns=now_ns,
             request=0 if has_field else 1,
             wanted="" if has_field else WorkOrder.SOLVE.value,
-            requested_ns=now.now_ns,
+            requested_ns=now_ns,
             start_um=nowhere if self.observes else np.asarray(self.start, np.float64),
             goal_um=nowhere if self.observes else np.asarray(self.goal, np.float64),
             finished=False,
@@ -207,212 +191,202 @@ class MissionStateMachine:
             note="",
         )
 
-    def _observe(self, previous: Mission, now: MissionInputs) -> Mission:
+    def _observe(self, now: MissionFrame) -> Mission:
         """Wait for the assumed flow and for the end of the frames, then for the refinement."""
-        if previous.finished:
-            return previous
-        mission, operator = previous, now.operator
+        if now.mission.finished:
+            return now.mission
         if now.command in (Action.STOP, Action.ZERO):
-            note = operator.text if operator is not None else ""
-            return finish(mission, now, Outcome.STOPPED, note or f"operator: {now.command}")
+            return now.stop(Outcome.STOPPED)
         if now.command in _STEERING:
-            mission = replace(mission, stamp_ns=now.now_ns, note=f"{now.command} refused: the robot is only observed")
-        if now.command == Action.END and not mission.input_ended:
-            mission = replace(mission, stamp_ns=now.now_ns, input_ended=True)
+            now = now.going_on(note=f"{now.command} refused: the robot is only observed")
+        if now.command == Action.END and not now.mission.input_ended:
+            now = now.going_on(input_ended=True)
+        mission = now.mission
         if now.refused:
-            return finish(mission, now, Outcome.NOT_FOUND, now.not_found_note)
-        if mission.wanted and now.result(mission) is None:
+            return now.finish(Outcome.NOT_FOUND, now.not_found_note)
+        if mission.wanted and now.result() is None:
             return mission
         if mission.wanted == WorkOrder.REFINE:
-            return finish(mission, now, Outcome.OBSERVE_COMPLETE)
+            return now.finish(Outcome.OBSERVE_COMPLETE)
         if not mission.input_ended:
-            return replace(mission, stamp_ns=now.now_ns, wanted="") if mission.wanted else mission
+            return now.with_changes(wanted="") if mission.wanted else mission
         if now.track.seen_ns is None:
-            return finish(mission, now, Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {IN_VIEW}"))
-        return order(mission, now, Phase.OBSERVE, WorkOrder.REFINE)
+            return now.finish(Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {IN_VIEW}"))
+        return now.order(Phase.OBSERVE, WorkOrder.REFINE)
 
-    def _after_command(self, mission: Mission, now: MissionInputs) -> Mission:
+    def _after_command(self, now: MissionFrame) -> Mission:
         """The mission after the operator's command; the mission itself if there is none.
 
         A held mission does not advance, whatever it waits for, and its time limits are suspended.
         """
-        command, since_ns = now.command, mission.held_since_ns
+        command, mission = now.command, now.mission
+        since_ns = mission.held_since_ns
         if command in (Action.STOP, Action.ZERO):
-            note = now.operator.text if now.operator is not None else ""
             arrived = command == Action.STOP and mission.arrived_s is not None
-            outcome = Outcome.REACHED if arrived else Outcome.STOPPED
-            return finish(mission, now, outcome, note or f"operator: {command}")
+            return now.stop(Outcome.REACHED if arrived else Outcome.STOPPED)
         if command == Action.GOAL:
-            return with_goal(mission, now)
+            return with_goal(now)
         if command == Action.SPEED:
-            return with_speed_limit(mission, now)
+            assert now.operator is not None
+            return now.with_changes(speed_limit_um_s=now.operator.speed_limit_um_s, speed_set_ns=now.now_ns)
         if command == Action.PAUSE and since_ns is None:
-            return replace(mission, stamp_ns=now.now_ns, held_since_ns=now.now_ns)
+            return now.with_changes(held_since_ns=now.now_ns)
         if command == Action.RESUME and since_ns is not None:
-            held_ns = mission.held_ns + now.now_ns - since_ns
-            return replace(mission, stamp_ns=now.now_ns, held_since_ns=None, held_ns=held_ns, swept=False)
+            return now.with_changes(held_since_ns=None, held_ns=mission.held_ns + now.now_ns - since_ns, swept=False)
         return mission
 
-    def _advance(self, previous: Mission, now: MissionInputs, result: FlowField | Route | None) -> Mission:
+    def _advance(self, now: MissionFrame) -> Mission:
         """The next state when no work is pending, or its result has just arrived."""
-        phase, route = previous.phase, now.route
-        if not now.track.seen and phase != Phase.START:
-            return previous  # nothing begins while the robot is out of sight
-        if phase == Phase.START:
-            if isinstance(result, Route):  # of the survey
-                if result.reachable:
-                    return transition(previous, now, Phase.SURVEY, result.reason)
-                return self._next_phase(Phase.SURVEY, previous, now, f"no survey: {result.reason}")
-            if not now.track.seen:
-                return replace(previous, stamp_ns=now.now_ns, wanted="") if previous.wanted else previous
-            if self.hold_start_s is not None and elapsed_s(previous, now) < self.hold_start_s:
-                return previous
-            if Phase.SURVEY in self.phases:
-                return order(previous, now, Phase.START, WorkOrder.SURVEY_ROUTE)
-            return self._next_phase(Phase.SURVEY, previous, now)
-        if phase == Phase.REFINE:
-            return self._next_phase(Phase.REFINE, previous, now)
-        if phase == Phase.PLAN:
-            return self._plan(previous, now, result)
+        mission, route = now.mission, now.route
+        if mission.phase == Phase.START:
+            return self._start(now)
+        if not now.track.seen:
+            return mission  # nothing begins while the robot is out of sight
+        if mission.phase == Phase.REFINE:
+            return self._next_phase(Phase.REFINE, now)
+        if mission.phase == Phase.PLAN:
+            return self._plan(now)
         assert route is not None
-        if phase == Phase.SURVEY:
-            return self._survey(previous, now, route, result)
-        return self._navigate(previous, now, route, result)
+        return self._survey(now, route) if mission.phase == Phase.SURVEY else self._navigate(now, route)
 
-    def _plan(self, previous: Mission, now: MissionInputs, result: FlowField | Route | None) -> Mission:
+    def _start(self, now: MissionFrame) -> Mission:
+        """With a stretch of the survey on the way; else once the robot is seen, and no longer held by other means."""
+        result = now.result()
+        if isinstance(result, Route):  # of the survey
+            if result.reachable:
+                return now.transition(Phase.SURVEY, result.reason)
+            return self._next_phase(Phase.SURVEY, now, f"no survey: {result.reason}")
+        if not now.track.seen:
+            return now.with_changes(wanted="") if now.mission.wanted else now.mission
+        if self.hold_start_s is not None and now.elapsed_s() < self.hold_start_s:
+            return now.mission
+        if Phase.SURVEY in self.phases:
+            return now.order(Phase.START, WorkOrder.SURVEY_ROUTE)
+        return self._next_phase(Phase.SURVEY, now)
+
+    def _plan(self, now: MissionFrame) -> Mission:
         """With a route on the way; where there is none to a new goal, back to the former one."""
-        if not isinstance(result, Route) or not is_current(previous):
-            return routine_order(previous, now, Phase.PLAN, previous.note)
+        mission, result = now.mission, now.result()
+        if not isinstance(result, Route) or not is_current(mission):
+            return now.routine_order(Phase.PLAN, mission.note)
         if result.reachable:
-            return confirm_goal(self._next_phase(Phase.PLAN, previous, now, result.reason))
-        if is_asked(previous):
-            former = refuse_goal(previous, result.reason)
-            return routine_order(former, now, Phase.PLAN, former.note)
-        if previous.speed_limit_um_s is not None:
-            return held_without_route(previous, now, result.reason)
-        return finish(previous, now, Outcome.UNREACHABLE, result.reason)
+            return confirm_goal(self._next_phase(Phase.PLAN, now, result.reason))
+        if is_asked(mission):
+            now = refuse_goal(now, result.reason)
+            return now.routine_order(Phase.PLAN, now.mission.note)
+        if mission.speed_limit_um_s is not None:  # a person must change that
+            note = f"no route at {mission.speed_limit_um_s:g} um/s: {result.reason}; set another speed limit or goal"
+            return now.with_changes(wanted="", held_since_ns=now.now_ns, note=f"{note}, then go on")
+        return now.finish(Outcome.UNREACHABLE, result.reason)
 
-    def _survey(self, previous: Mission, now: MissionInputs, route: Route, result: FlowField | Route | None) -> Mission:
+    def _survey(self, now: MissionFrame, route: Route) -> Mission:
         """On a stretch: the next one is ordered before its end; an order under way is waited for, at the end at rest.
 
         The phase ends with the last stretch, or with its time limit.
         """
+        mission, result = now.mission, now.result()
         if result is not None:
             assert isinstance(result, Route)
-            return transition(previous, now, Phase.SURVEY, result.reason)
-        if previous.wanted:
-            return previous
-        slowed = previous.speed_set_ns is not None  # its times are those of another speed
+            return now.transition(Phase.SURVEY, result.reason)
+        if mission.wanted:
+            return mission
+        slowed = mission.speed_set_ns is not None  # its times are those of another speed
         limit_s = self.survey_limit_s if slowed else self._time_limit_s(self.survey_limit_s, route)
-        if elapsed_s(previous, now) > limit_s:
-            return self._next_phase(Phase.SURVEY, previous, now, "survey cut short by its time limit")
-        if not slowed and self._is_stuck(previous, now):
-            return self._next_phase(Phase.SURVEY, previous, now, "survey cut short: something is in the way")
-        near_end = left_s(now, route) <= self.lead_s
+        if now.elapsed_s() > limit_s:
+            return self._next_phase(Phase.SURVEY, now, "survey cut short by its time limit")
+        if not slowed and self._is_stuck(now):
+            return self._next_phase(Phase.SURVEY, now, "survey cut short: something is in the way")
+        near_end = now.left_s(route) <= self.lead_s
         if route.more:
             if not near_end:
-                return previous
-            return order(
-                *(previous, now, Phase.SURVEY, WorkOrder.SURVEY_ROUTE),
-                start_um=route.waypoints_um[-1],
-                routine_orders=previous.routine_orders + 1,
-            )
+                return mission
+            return now.routine_order(Phase.SURVEY, wanted=WorkOrder.SURVEY_ROUTE, start_um=route.waypoints_um[-1])
         # A survey of several stretches may pass its end on the way.
-        if at_end(now, route) and (near_end or not previous.routine_orders):
-            return self._next_phase(Phase.SURVEY, previous, now)
-        return previous
+        if now.at_end(route) and (near_end or not mission.routine_orders):
+            return self._next_phase(Phase.SURVEY, now)
+        return mission
 
-    def _is_stuck(self, previous: Mission, now: MissionInputs, radii: float = 1.0) -> bool:
+    def _is_stuck(self, now: MissionFrame, radii: float = 1.0) -> bool:
         """True if the robot is off its reference by more than some radii, and both are late.
 
         What may block a channel is not on the map. The reference waits for the robot.
         """
         if not self.stuck_s or now.demand is None or now.demand.error_um <= radii * now.robot.radius_um:
             return False
-        late_s = elapsed_s(previous, now) - now.demand.progress_s
+        late_s = now.elapsed_s() - now.demand.progress_s
         return late_s > self.stuck_s + _SLOWER * now.demand.progress_s
 
     def _time_limit_s(self, limit_s: float, route: Route, from_s: float = 0.0) -> float:
         """Time limit of a route, `from_s` along it on: for a robot that is stuck, waiting does not help."""
         return from_s + min(limit_s, self.patience * (float(route.arrival_s[-1]) - from_s) + _EXTRA_S)
 
-    def _other_speed(self, previous: Mission, now: MissionInputs) -> str:
+    def _other_speed(self, now: MissionFrame) -> str:
         """Reason to plan for another speed: the robot has become slower, or a person lets it be faster; '' if none."""
-        planned_um_s, able_um_s = previous.planned_um_s, now.robot.speed_limit_um_s
+        mission, planned_um_s, able_um_s = now.mission, now.mission.planned_um_s, now.robot.speed_limit_um_s
         if planned_um_s is None:
             return ""
         if able_um_s < self.replan_slower * planned_um_s:
             return f"the robot reaches {able_um_s:.0f} um/s and not {planned_um_s:.0f}: planning anew"
-        set_since = previous.speed_set_ns is not None and previous.speed_set_ns > previous.requested_ns
+        set_since = mission.speed_set_ns is not None and mission.speed_set_ns > mission.requested_ns
         if set_since and planned_um_s < self.replan_slower * able_um_s:
             return f"the robot may reach {able_um_s:.0f} um/s and not only {planned_um_s:.0f}: planning anew"
         return ""
 
-    def _navigate(
-        self, previous: Mission, now: MissionInputs, route: Route, result: FlowField | Route | None
-    ) -> Mission:
+    def _navigate(self, now: MissionFrame, route: Route) -> Mission:
         """At the goal, too late, too far off the route, or still on the way."""
-        other_speed = self._other_speed(previous, now)
-        if is_asked(previous):
-            return on_the_way(previous, now, route, result, self.lead_s, other_speed)
-        tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else now.robot.radius_um
-        arrived_s = previous.arrived_s
-        if arrived_s is None and math.dist(now.estimate.position_um, previous.goal_um) <= tolerance_um:
+        mission, other_speed = now.mission, self._other_speed(now)
+        if is_asked(mission):
+            return on_the_way(now, route, self.lead_s, other_speed)
+        place_um, radius_um = now.estimate.position_um, now.robot.radius_um
+        tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else radius_um
+        arrived_s = mission.arrived_s
+        if arrived_s is None and math.dist(place_um, mission.goal_um) <= tolerance_um:
             if not self.wait_at_goal_s:
-                return finish(previous, now, Outcome.REACHED)
-            arrived_s = elapsed_s(previous, now)
+                return now.finish(Outcome.REACHED)
             note = f"at the goal: waits {self.wait_at_goal_s:g} s for another one"
-            return replace(previous, stamp_ns=now.now_ns, arrived_s=arrived_s, note=note)
-        if arrived_s is not None and elapsed_s(previous, now) - arrived_s >= self.wait_at_goal_s:
-            return finish(previous, now, Outcome.REACHED)
-        limit_s = self._time_limit_s(self.navigate_limit_s, route, previous.goal_from_s)
-        if arrived_s is None and elapsed_s(previous, now) > limit_s:
+            return now.with_changes(arrived_s=now.elapsed_s(), note=note)
+        if arrived_s is not None and now.elapsed_s() - arrived_s >= self.wait_at_goal_s:
+            return now.finish(Outcome.REACHED)
+        limit_s = self._time_limit_s(self.navigate_limit_s, route, mission.goal_from_s)
+        if arrived_s is None and now.elapsed_s() > limit_s:
             note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
-            return finish(previous, now, Outcome.TIMEOUT, note)
-        if previous.wanted and result is None:
-            return previous  # one order at a time
+            return now.finish(Outcome.TIMEOUT, note)
+        if mission.wanted and now.result() is None:
+            return mission  # one order at a time
         if other_speed and arrived_s is None:
-            if previous.speed_set_ns is not None:
-                return routine_order(previous, now, Phase.PLAN, other_speed)
-            return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, other_speed)
-        limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius_um
-        stuck = self._is_stuck(previous, now, _WAITING_RADII)
+            if mission.speed_set_ns is not None:
+                return now.routine_order(Phase.PLAN, other_speed)
+            return now.order(Phase.PLAN, WorkOrder.ROUTE, other_speed)
+        limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * radius_um
+        stuck = self._is_stuck(now, _WAITING_RADII)
         if now.demand is None or not (stuck or now.demand.error_um > limit_um):
-            return self._look_again(previous, now, route, result)
-        if previous.request - previous.routine_orders >= self.orders_limit:
-            note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
-            return finish(previous, now, Outcome.GAVE_UP, note)
+            return self._look_again(now, route)
+        if mission.request - mission.routine_orders >= self.orders_limit:
+            note = f"blown off every one of {mission.request} routes and maps: the robot can not be held here"
+            return now.finish(Outcome.GAVE_UP, note)
         # Another route from here would be the same.
-        if stuck and math.dist(now.estimate.position_um, previous.start_um) <= 2.0 * now.robot.radius_um:
+        if stuck and math.dist(place_um, mission.start_um) <= 2.0 * radius_um:
             note = "stuck where its route begins: something that is not on the map is in the way"
-            return finish(previous, now, Outcome.GAVE_UP, note)
-        off = f"{now.demand.error_um:.0f} um off the route"
-        note = f"stuck {off}" if stuck else f"blown {off}"
-        return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, f"{note}: planning anew")
+            return now.finish(Outcome.GAVE_UP, note)
+        off = f"{'stuck' if stuck else 'blown'} {now.demand.error_um:.0f} um off the route"
+        return now.order(Phase.PLAN, WorkOrder.ROUTE, f"{off}: planning anew")
 
-    def _look_again(
-        self, previous: Mission, now: MissionInputs, route: Route, result: FlowField | Route | None
-    ) -> Mission:
+    def _look_again(self, now: MissionFrame, route: Route) -> Mission:
         """On the way: after some observations refine the map again, then ask whether another route is better now."""
-        wanted = None
-        if isinstance(result, FlowField) and previous.arrived_s is None:
+        mission, result = now.mission, now.result()
+        if isinstance(result, FlowField) and mission.arrived_s is None:
             wanted = WorkOrder.ROUTE
         elif result is not None:
-            return transition(
-                previous, now, Phase.NAVIGATE, result.reason if isinstance(result, Route) else previous.note
-            )
-        elif self._refines_again(now) and left_s(now, route) > 2.0 * self.lead_s:
+            return now.transition(Phase.NAVIGATE, result.reason if isinstance(result, Route) else mission.note)
+        elif self._refines_again(now) and now.left_s(route) > 2.0 * self.lead_s:
             wanted = WorkOrder.REFINE
-        if wanted is None:
-            return previous
+        else:
+            return mission
         assert now.demand is not None
-        return order(
-            *(previous, now, Phase.NAVIGATE, wanted),
-            start_um=position_at(route, now.demand.progress_s + self.lead_s),
-            routine_orders=previous.routine_orders + 1,
-        )
+        start_um = position_at(route, now.demand.progress_s + self.lead_s)
+        return now.routine_order(Phase.NAVIGATE, wanted=wanted, start_um=start_um)
 
-    def _refines_again(self, now: MissionInputs) -> bool:
+    def _refines_again(self, now: MissionFrame) -> bool:
         """True if enough observations have been made since the map was refined."""
         observations, refined = now.observations, now.refined
         if not self.reassimilate_observations or Phase.REFINE not in self.phases:
@@ -422,16 +396,14 @@ class MissionStateMachine:
         new = observations.time_s > seconds(refined.stamp_ns)
         return int(np.count_nonzero(new)) >= self.reassimilate_observations
 
-    def _next_phase(self, done: Phase, previous: Mission, now: MissionInputs, note: str = "") -> Mission:
+    def _next_phase(self, done: Phase, now: MissionFrame, note: str = "") -> Mission:
         """Enter the first selected phase after `done`, or end the run."""
         selected: set[str] = {*self.phases, Phase.PLAN} if Phase.NAVIGATE in self.phases else set(self.phases)
         name = next((name for name in PHASES[PHASES.index(done) + 1 :] if name in selected), None)
         if name is None:
-            return finish(previous, now, Outcome(f"{done} complete"), note)
+            return now.finish(Outcome(f"{done} complete"), note)
         phase, orders = Phase(name), {"refine": WorkOrder.REFINE, "plan": WorkOrder.ROUTE}
-        if name in orders:
-            return order(previous, now, phase, orders[name], note)
-        return transition(previous, now, phase, note)
+        return now.order(phase, orders[name], note) if name in orders else now.transition(phase, note)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

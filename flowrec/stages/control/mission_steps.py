@@ -1,4 +1,4 @@
-"""Inputs of the mission's state machine on a frame, and the transitions from one state to the next."""
+"""The mission on a frame with its inputs, the transitions to the mission after it, and what is done without sight."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from flowrec.core import (
     Applied,
     Demand,
     Estimate,
+    Floats,
     FlowField,
     Mission,
     Observations,
@@ -23,13 +24,15 @@ from flowrec.core import (
 )
 from flowrec.physics import Robot
 
+IN_VIEW = "is it in view (camera.um_per_px), and of the size in robot.radius_um?"
 _SWEPT_RADII, _RETURNED_RADII = 2.0, 1.0  # from its position, of a held robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MissionInputs:
-    """Inputs of the state machine on one frame."""
+class MissionFrame:
+    """The mission before a frame, and the inputs of the state machine on it."""
 
+    mission: Mission
     track: Track
     estimate: Estimate
     assumed: FlowField | None
@@ -57,7 +60,7 @@ class MissionInputs:
         """Action of the operator on this frame, '' if none."""
         return self.operator.action if self.operator is not None and self.operator.stamp_ns == self.now_ns else ""
 
-    def result(self, mission: Mission) -> FlowField | Route | None:
+    def result(self) -> FlowField | Route | None:
         """The result that the mission waits for, once it has arrived."""
         results: dict[str, FlowField | Route | None] = {
             WorkOrder.SOLVE: self.assumed,
@@ -65,87 +68,137 @@ class MissionInputs:
             WorkOrder.SURVEY_ROUTE: self.route,
             WorkOrder.ROUTE: self.route,
         }
-        result = results.get(mission.wanted)
-        return result if result is not None and result.request == mission.request else None
+        result = results.get(self.mission.wanted)
+        return result if result is not None and result.request == self.mission.request else None
+
+    def elapsed_s(self) -> float:
+        """Duration of the phase, without the time during which it was held."""
+        held_ns = self.mission.held_ns
+        if self.mission.held_since_ns is not None:
+            held_ns += self.now_ns - self.mission.held_since_ns
+        return seconds(self.now_ns - self.mission.since_ns - held_ns)
+
+    def at_end(self, route: Route) -> bool:
+        """True if the robot is at the end of a route, or the reference is and the robot as near as it comes."""
+        demand, radius_um = self.demand, self.robot.radius_um
+        if math.dist(self.estimate.position_um, route.waypoints_um[-1]) <= radius_um:
+            return True
+        return demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2.0 * radius_um
+
+    def left_s(self, route: Route) -> float:
+        """Planned time until the reference is at the end of a route."""
+        progress_s = self.demand.progress_s if self.demand is not None else 0.0
+        return float(route.arrival_s[-1]) - progress_s
+
+    def with_changes(self, **changes: Any) -> Mission:
+        """The mission with other values from now on."""
+        return replace(self.mission, stamp_ns=self.now_ns, **changes)
+
+    def going_on(self, **changes: Any) -> MissionFrame:
+        """The frame on which the mission has other values already."""
+        return replace(self, mission=self.with_changes(**changes))
+
+    def transition(self, phase: Phase, note: str = "", wanted: WorkOrder | None = None, **changes: Any) -> Mission:
+        """The mission in a phase, which begins now unless it is the present one."""
+        if phase != self.mission.phase:
+            changes = {"since_ns": self.now_ns, "held_ns": 0, "goal_from_s": 0.0, "arrived_s": None} | changes
+        return self.with_changes(
+            phase=phase.value, wanted=wanted.value if wanted is not None else "", note=note, **changes
+        )
+
+    def order(self, phase: Phase, wanted: WorkOrder, note: str = "", **changes: Any) -> Mission:
+        """The mission in a phase that waits for a new work order, whose route begins at the robot unless stated."""
+        asked: dict[str, Any] = {
+            "request": self.mission.request + 1,
+            "requested_ns": self.now_ns,
+            "start_um": self.estimate.position_um,
+            "planned_um_s": self.robot.speed_limit_um_s,
+        }
+        return self.transition(phase, note, wanted, **asked | changes)
+
+    def routine_order(
+        self, phase: Phase, note: str = "", wanted: WorkOrder = WorkOrder.ROUTE, start_um: Floats | None = None
+    ) -> Mission:
+        """A new order that no disturbance has caused; its route begins at the robot unless stated."""
+        changes = {} if start_um is None else {"start_um": start_um}
+        return self.order(phase, wanted, note, routine_orders=self.mission.routine_orders + 1, **changes)
+
+    def finish(self, outcome: Outcome, note: str = "") -> Mission:
+        """The finished mission."""
+        return self.transition(
+            Phase.DONE,
+            note,
+            finished=True,
+            outcome=outcome.value,
+            held_since_ns=None,
+            swept=False,
+            blind_since_ns=None,
+            blind="",
+            field_off=False,
+        )
+
+    def stop(self, outcome: Outcome) -> Mission:
+        """The mission that the operator has finished."""
+        assert self.operator is not None
+        return self.finish(outcome, self.operator.text or f"operator: {self.command}")
 
 
-def note_swept(previous: Mission, now: MissionInputs) -> Mission:
+def note_swept(now: MissionFrame) -> Mission:
     """Note in the mission that a held robot is swept away: beyond two radii, until it is back within one."""
+    mission = now.mission
     if not now.track.seen or now.demand is None or not math.isfinite(now.demand.error_um):
-        return previous
-    limit_radii = _RETURNED_RADII if previous.swept else _SWEPT_RADII
+        return mission
+    limit_radii = _RETURNED_RADII if mission.swept else _SWEPT_RADII
     swept = now.demand.error_um > limit_radii * now.robot.radius_um
-    return previous if swept == previous.swept else replace(previous, stamp_ns=now.now_ns, swept=swept)
+    return mission if swept == mission.swept else now.with_changes(swept=swept)
 
 
-def elapsed_s(mission: Mission, now: MissionInputs) -> float:
-    """Duration of the phase, without the time during which it was held."""
-    held_ns = mission.held_ns
-    if mission.held_since_ns is not None:
-        held_ns += now.now_ns - mission.held_since_ns
-    return seconds(now.now_ns - mission.since_ns - held_ns)
+def end_if_lost(now: MissionFrame, find_limit_s: float, lost_limit_frames: int) -> Mission | None:
+    """The end of a run whose robot was not found, or not seen for too many frames.
+
+    A camera that was absent and is back has as much time to find the robot as in the beginning.
+    """
+    absent_ns = now.applied.absent_until_ns if now.applied is not None else None
+    if now.track.seen or (absent_ns is not None and seconds(now.now_ns - absent_ns) <= find_limit_s):
+        return None
+    if now.mission.phase == Phase.START:
+        if now.refused:
+            return now.finish(Outcome.NOT_FOUND, now.not_found_note)
+        seen_ns = now.track.seen_ns
+        if seen_ns is not None and seconds(now.now_ns - seen_ns) <= find_limit_s:
+            return None  # it was found, and this image does not show it
+        if now.elapsed_s() > find_limit_s:
+            note = f"no robot seen in the image for {find_limit_s:g} s; {IN_VIEW}"
+            return now.finish(Outcome.NOT_FOUND, now.with_advice(note))
+    elif now.track.lost_frames > lost_limit_frames:
+        why = f"{now.mission.blind}, " if now.mission.blind else "robot not seen in "
+        return now.finish(Outcome.LOST, f"{why}{now.track.lost_frames} frames")
+    return None
 
 
-def at_end(now: MissionInputs, route: Route) -> bool:
-    """True if the robot is at the end of a route, or the reference is and the robot as near as it comes."""
-    if math.dist(now.estimate.position_um, route.waypoints_um[-1]) <= now.robot.radius_um:
-        return True
-    demand = now.demand
-    return (
-        demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2.0 * now.robot.radius_um
-    )
+def without_sight(now: MissionFrame, hold_after_s: float, zero_after_s: float, find_limit_s: float) -> Mission:
+    """Without sight of the robot: hold it, then switch the field off, then end; continue when it is seen again.
 
-
-def left_s(now: MissionInputs, route: Route) -> float:
-    """Planned time until the reference is at the end of a route."""
-    progress_s = now.demand.progress_s if now.demand is not None else 0.0
-    return float(route.arrival_s[-1]) - progress_s
-
-
-def transition(
-    previous: Mission, now: MissionInputs, phase: Phase, note: str = "", wanted: WorkOrder | None = None, **changes: Any
-) -> Mission:
-    """The mission in a phase, which begins now unless it is the present one."""
-    new = phase != previous.phase
-    return replace(
-        previous,
-        stamp_ns=now.now_ns,
-        phase=phase.value,
-        since_ns=now.now_ns if new else previous.since_ns,
-        held_ns=0 if new else previous.held_ns,
-        goal_from_s=0.0 if new else previous.goal_from_s,
-        arrived_s=None if new else previous.arrived_s,
-        wanted=wanted.value if wanted is not None else "",
-        note=note,
-        **changes,
-    )
-
-
-def order(
-    previous: Mission, now: MissionInputs, phase: Phase, wanted: WorkOrder, note: str = "", **changes: Any
-) -> Mission:
-    """The mission in a phase that waits for a new work order, whose route begins at the robot unless stated."""
-    asked: dict[str, Any] = {
-        "request": previous.request + 1,
-        "requested_ns": now.now_ns,
-        "start_um": now.estimate.position_um,
-        "planned_um_s": now.robot.speed_limit_um_s,
-    }
-    return transition(previous, now, phase, note, wanted, **asked | changes)
-
-
-def finish(previous: Mission, now: MissionInputs, outcome: Outcome, note: str = "") -> Mission:
-    """The finished mission."""
-    return transition(
-        previous,
-        now,
-        Phase.DONE,
-        note,
-        finished=True,
-        outcome=outcome.value,
-        held_since_ns=None,
-        swept=False,
-        blind_since_ns=None,
-        blind="",
-        field_off=False,
-    )
+    If it was carried too far off its route meanwhile, a new one is planned as after any other disturbance. While
+    the camera is absent the field is off; the rig says when that has lasted too long.
+    """
+    mission, applied, seen_ns, blind_ns = now.mission, now.applied, now.track.seen_ns, now.mission.blind_since_ns
+    if applied is None or seen_ns is None or applied.image_since_ns is None:  # never seen yet, or an older session
+        return mission
+    if now.track.seen:
+        return mission if blind_ns is None else now.with_changes(blind_since_ns=None, blind="", field_off=False)
+    absent_ns = applied.absent_until_ns
+    unseen_s = seconds(now.now_ns - (seen_ns if absent_ns is None else max(seen_ns, absent_ns)))
+    why = f"robot not seen since {seconds(seen_ns):.1f} s"
+    if applied.without_image:
+        why = f"no image since {seconds(applied.image_since_ns):.1f} s: the camera is absent"
+    elif applied.repeats_image:
+        why = f"the camera repeats one image since {seconds(applied.image_since_ns):.1f} s"
+    if not applied.without_image and unseen_s >= zero_after_s + find_limit_s:
+        return now.finish(Outcome.LOST, why)
+    since_ns = now.now_ns if blind_ns is None else blind_ns
+    if (applied.without_image or unseen_s >= zero_after_s) and not mission.field_off:
+        return now.with_changes(blind_since_ns=since_ns, blind=why, field_off=True)
+    if not applied.without_image and unseen_s >= hold_after_s and blind_ns is None:
+        return now.with_changes(blind_since_ns=since_ns, blind=why)
+    return mission

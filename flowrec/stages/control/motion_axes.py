@@ -12,9 +12,8 @@ from array import array
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Applied, AxesCheck, AxesVerdict, Tick
+from flowrec.core import NS_PER_S, Applied, AxesCheck, AxesVerdict, Floats, Tick
 from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, Orientation, Robot, camera_settings, likeness
 from flowrec.stages.control.coils import Coils
 
@@ -37,7 +36,7 @@ class MotionVerdict:
     orientation: Orientation = AS_STATED
 
 
-def orientation_by_motion(gain: NDArray[np.float64], std: NDArray[np.float64] | float) -> MotionVerdict:
+def orientation_by_motion(gain: Floats, std: Floats | float) -> MotionVerdict:
     """The verdict of a gain (2, 2) whose elements have these standard deviations (2, 2), or all of them this one."""
     errors = np.broadcast_to(np.asarray(std, np.float64), (2, 2))
     if not np.isfinite(errors).all() or not np.isfinite(gain).all():
@@ -87,9 +86,7 @@ class MotionOfRun:
         return [] if found.verdict == AxesVerdict.AGREES else [self._axes.text]
 
 
-def own_gain(
-    stamps_s: NDArray[np.float64], positions_um: NDArray[np.float64], own_um: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def own_gain(stamps_s: Floats, positions_um: Floats, own_um: Floats) -> tuple[Floats, Floats]:
     """The gain (2, 2) of a whole recording, and the standard deviations (2, 2) of its elements, by a jackknife.
 
     Second differences over a quarter of a second or more are compared: the flow changes slowly against the commands.
@@ -105,7 +102,7 @@ def own_gain(
         return bad
     at = np.arange(stamps_s[0] + lag_s, stamps_s[-1] - lag_s, 0.5 * lag_s)
 
-    def bend(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def bend(values: Floats) -> Floats:
         before, now, after = (
             np.column_stack([np.interp(at + shift, stamps_s, values[:, axis]) for axis in (0, 1)])
             for shift in (-lag_s, 0.0, lag_s)

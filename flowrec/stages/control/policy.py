@@ -15,11 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import cells_at, nearest_pixel
+from flowrec.core import Floats, cells_at, nearest_pixel
 from flowrec.stages.control.tracking_laws import Reference, Situation, VectorLaw
 from flowrec.stages.control.trajectory import nearest_time, position_at
 
-Vector = NDArray[np.float64]
 Raster = NDArray[np.float32]
 _HEADINGS = 64
 _STEP_PX = 1.5  # between points that are evaluated on the way, so that no wall is missed
@@ -48,7 +47,7 @@ class Policy(VectorLaw):
         goal = route.waypoints_um[-1]
         left_um = math.dist(goal, now.predicted_um)
         drift = now.flow_um_s / robot.speed_limit_um_s
-        fastest = 1.0 + math.hypot(drift[0], drift[1])  # over ground, in units of the robot's own speed
+        fastest = 1.0 + math.hypot(*drift)  # over ground, in units of the robot's own speed
         frame_um = robot.speed_limit_um_s * now.dt_s
         hold = left_um <= max(self.hold_radii * robot.radius_um, um_per_px, fastest * frame_um)
         progress_s = float(route.arrival_s[-1]) if hold else nearest_time(route, now.estimate.position_um)
@@ -66,7 +65,7 @@ class Policy(VectorLaw):
             else steepest_descent(route.time_to_go_s, um_per_px, now.predicted_um, distance_um, drift),
         )
 
-    def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
+    def velocity(self, now: Situation, reference: Reference) -> tuple[Floats, bool]:
         """As in TrackingLaw."""
         if reference.heading is None:
             return VectorLaw.velocity(self, now, reference)
@@ -74,8 +73,8 @@ class Policy(VectorLaw):
 
 
 def steepest_descent(
-    time_to_go_s: Raster, um_per_px: float, point_um: Vector, distance_um: float, drift: Vector | None = None
-) -> Vector:
+    time_to_go_s: Raster, um_per_px: float, point_um: Floats, distance_um: float, drift: Floats | None = None
+) -> Floats:
     """Unit vector (2,): the heading for which T is least after the robot has swum a distance from a point.
 
     Where T is unknown in all directions, the heading is that to the nearest pixel where it is known.
@@ -104,7 +103,7 @@ def steepest_descent(
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def distance_to_known(time_to_go_s: Raster, um_per_px: float, point_um: Vector) -> float:
+def distance_to_known(time_to_go_s: Raster, um_per_px: float, point_um: Floats) -> float:
     """Distance from a point (2,) to the nearest pixel with a time, 0 up to half a diagonal; inf if no pixel has one."""
     point = point_um / um_per_px
     row, column = nearest_pixel(float(point[0]), float(point[1]), time_to_go_s.shape)
@@ -115,7 +114,7 @@ def distance_to_known(time_to_go_s: Raster, um_per_px: float, point_um: Vector) 
     return max(math.hypot(*(nearest - point)) - math.sqrt(0.5), 0.0) * um_per_px
 
 
-def _towards_known(time_to_go_s: Raster, point: Vector) -> Vector:
+def _towards_known(time_to_go_s: Raster, point: Floats) -> Floats:
     """Unit vector from a point (px) to the nearest pixel with a time; zero if there is none, or the robot is on it."""
     nearest = _nearest_known(time_to_go_s, point)
     difference = np.zeros(2) if nearest is None else nearest - point
@@ -123,7 +122,7 @@ def _towards_known(time_to_go_s: Raster, point: Vector) -> Vector:
     return np.asarray(difference / length) if length > 0.0 else np.zeros(2)
 
 
-def _nearest_known(time_to_go_s: Raster, point: Vector) -> Vector | None:
+def _nearest_known(time_to_go_s: Raster, point: Floats) -> Floats | None:
     """(2,) px, the nearest pixel with a time: searched nearby first, then everywhere."""
     h, w = time_to_go_s.shape
     x, y = min(max(float(point[0]), 0.0), w - 1.0), min(max(float(point[1]), 0.0), h - 1.0)

@@ -11,15 +11,27 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Demand, Estimate, FlowField, Mission, Route
+from flowrec.core import Demand, Estimate, Floats, FlowField, Mission, Route
 from flowrec.physics import Robot, sample
-from flowrec.stages.control.delay_compensation import CorrectedFlow
 
-Vector = NDArray[np.float64]
 _NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are meant for
+_MOST_DEMANDS = 100  # remembered, whatever delay and frame rate
 _LARGEST_CORRECTION = 0.3  # of an error, within one frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedFlow:
+    """The map of the flow, corrected by what the observer finds at the robot."""
+
+    field: FlowField | None
+    correction_um_s: Floats  # (2,) added to the map near the robot; without a map the flow itself
+
+    def at(self, point_um: Floats) -> Floats:
+        """(2,) um/s."""
+        if self.field is None:
+            return self.correction_um_s
+        return sample(self.field, point_um) + self.correction_um_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,13 +45,13 @@ class Situation:
     field: FlowField | None
     flow: CorrectedFlow
     robot: Robot
-    predicted_um: Vector  # position of the robot when a demand of now takes effect
+    predicted_um: Floats  # position of the robot when a demand of now takes effect
     limit_um_s: float  # largest speed that may be demanded
     dt_s: float  # since the previous frame, 0 on the first
     um_per_px: float  # of the chip's mask
 
     @property
-    def flow_um_s(self) -> Vector:
+    def flow_um_s(self) -> Floats:
         """Flow at the predicted position."""
         return self.flow.at(self.predicted_um)
 
@@ -54,15 +66,15 @@ class Situation:
 class Reference:
     """Reference position now, and position and velocity at the time when the present demand takes effect."""
 
-    position_um: Vector
-    future_um: Vector
-    velocity_um_s: Vector
+    position_um: Floats
+    future_um: Floats
+    velocity_um_s: Floats
     progress_s: float  # time along the route
     error_um: float
-    heading: Vector | None = None  # direction to swim in; a policy sets it, and the positions only inform people
+    heading: Floats | None = None  # direction to swim in; a policy sets it, and the positions only inform people
 
     @staticmethod
-    def at_rest(position_um: Vector, estimate: Estimate, progress_s: float) -> Reference:
+    def at_rest(position_um: Floats, estimate: Estimate, progress_s: float) -> Reference:
         """The reference that holds a position."""
         error_um = math.dist(position_um, estimate.position_um)
         return Reference(position_um, position_um, np.zeros(2), progress_s, error_um)
@@ -76,7 +88,7 @@ class TrackingLaw(ABC):
         return None
 
     @abstractmethod
-    def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
+    def velocity(self, now: Situation, reference: Reference) -> tuple[Floats, bool]:
         """The demand without regard to walls, and whether the speed limit reduced it."""
 
 
@@ -86,7 +98,7 @@ class VectorLaw(TrackingLaw):
 
     kp_per_s: float
 
-    def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
+    def velocity(self, now: Situation, reference: Reference) -> tuple[Floats, bool]:
         """As in TrackingLaw."""
         error = reference.future_um - now.predicted_um
         over_ground = reference.velocity_um_s + now.scaled_rate(self.kp_per_s) * error
@@ -104,16 +116,16 @@ class FeedforwardFeedback(TrackingLaw):
 
     ff_fb_kp_per_s: float
 
-    def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
+    def velocity(self, now: Situation, reference: Reference) -> tuple[Floats, bool]:
         """As in TrackingLaw."""
         error = reference.future_um - now.estimate.position_um
         return limit_length(self.law(error, reference.velocity_um_s, self.flow(now), now.dt_s), now.limit_um_s)
 
-    def flow(self, now: Situation) -> Vector:
+    def flow(self, now: Situation) -> Floats:
         """The flow that is compensated: that of the map, or of the observer without a map."""
         return sample(now.field, now.estimate.position_um) if now.field is not None else now.estimate.flow_um_s
 
-    def law(self, error_um: Vector, velocity_um_s: Vector, flow_um_s: Vector, dt_s: float) -> Vector:
+    def law(self, error_um: Floats, velocity_um_s: Floats, flow_um_s: Floats, dt_s: float) -> Floats:
         """The demand (2,) before the speed limit; `error_um` is xd - x, `velocity_um_s` is xd_dot."""
         e = error_um - flow_um_s * dt_s
         feedforward = velocity_um_s - flow_um_s
@@ -123,7 +135,7 @@ class FeedforwardFeedback(TrackingLaw):
         weight = across / (along + across) if along + across > 1e-9 else 0.0
         heading = self.mean_heading(math.atan2(feedforward[1], feedforward[0]), math.atan2(e[1], e[0]), weight)
         unit = np.array([math.cos(heading), math.sin(heading)])
-        return (math.hypot(feedforward[0], feedforward[1]) + self.ff_fb_kp_per_s * float(e @ unit)) * unit
+        return (math.hypot(*feedforward) + self.ff_fb_kp_per_s * float(e @ unit)) * unit
 
     def mean_heading(self, feedforward: float, feedback: float, weight: float) -> float:
         """The heading at a fraction `weight` of the shorter arc from one to the other."""
@@ -142,7 +154,7 @@ class LiteralFeedforwardFeedback(FeedforwardFeedback):
 class UncompensatedFeedforwardFeedback(FeedforwardFeedback):
     """The law without flow compensation."""
 
-    def flow(self, now: Situation) -> Vector:
+    def flow(self, now: Situation) -> Floats:
         """Zero."""
         return np.zeros(2)
 
@@ -150,19 +162,19 @@ class UncompensatedFeedforwardFeedback(FeedforwardFeedback):
 class ObserverFeedforwardFeedback(FeedforwardFeedback):
     """The law with the observer's flow."""
 
-    def flow(self, now: Situation) -> Vector:
+    def flow(self, now: Situation) -> Floats:
         """The observer's, whether there is a map or not."""
         return now.estimate.flow_um_s
 
 
-def compensate_flow(over_ground_um_s: Vector, flow_um_s: Vector, limit_um_s: float) -> tuple[Vector, bool]:
+def compensate_flow(over_ground_um_s: Floats, flow_um_s: Floats, limit_um_s: float) -> tuple[Floats, bool]:
     """The demand relative to the fluid for a velocity g over ground, and whether the limit reduced it.
 
     To keep the robot on its course, the flow across it is compensated first: of all u = s g - v within the limit, this
     is the one with s nearest to 1. Where the flow across the course alone exceeds the limit, u opposes it entirely.
     """
     demand = over_ground_um_s - flow_um_s
-    if math.hypot(demand[0], demand[1]) <= limit_um_s:
+    if math.hypot(*demand) <= limit_um_s:
         return demand, False
     gg = float(over_ground_um_s @ over_ground_um_s)
     if gg <= 0.0:
@@ -173,12 +185,69 @@ def compensate_flow(over_ground_um_s: Vector, flow_um_s: Vector, limit_um_s: flo
     return limit_length(s * over_ground_um_s - flow_um_s, limit_um_s)[0], True
 
 
-def limit_length(vector: Vector, limit: float) -> tuple[Vector, bool]:
+def limit_length(vector: Floats, limit: float) -> tuple[Floats, bool]:
     """The vector, scaled down to a length if it is longer, and whether it was."""
-    length = math.hypot(vector[0], vector[1])
+    length = math.hypot(*vector)
     return (vector, False) if length <= limit else (vector * (limit / length), True)
 
 
 def speed_ratio(robot: Robot) -> float:
     """Speed in radii per second over that of the robot that the settings are meant for; at least 1."""
     return max(1.0, robot.max_speed_um_s / robot.radius_um / _NOMINAL_RADII_PER_S)
+
+
+def corrected_flow(
+    field: FlowField | None, estimate: Estimate, sent_um_s: Floats, map_error: float, lag_s: float
+) -> CorrectedFlow:
+    """The map plus the observer's residual, weighted by the variances of both.
+
+    The observer's variance is that of the estimate, so an observer without measurements has no weight. An observer that
+    assumes a constant flow lags by about `lag_s`, so the change of the map over the displacement in that time is added
+    to its variance: where the robot enters another stream the map is better. The standard deviation of the map is its
+    own where it states one, else `map_error` times the speed; the correction never exceeds twice that.
+
+    Parameters
+    ----------
+    sent_um_s : (m, 2) demands that may still be on their way to the coils, oldest first.
+    """
+    if field is None:
+        return CorrectedFlow(None, estimate.flow_um_s)
+    mapped = sample(field, estimate.position_um)
+    map_std = map_error * float(np.hypot(*mapped)) + 1.0
+    if field.std_um_s is not None:
+        h, w = field.std_um_s.shape[:2]
+        column, row = np.rint(estimate.position_um / field.um_per_px).astype(int)
+        stated = field.std_um_s[min(max(row, 0), h - 1), min(max(column, 0), w - 1)]
+        map_std = max(0.3 * map_std, float(stated.max()))
+    velocity = mapped + sent_um_s[0] if len(sent_um_s) else mapped
+    change = mapped - sample(field, estimate.position_um - lag_s * velocity)
+    variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3]) + float(change @ change)
+    residual = estimate.flow_um_s - mapped
+    length = float(np.hypot(*residual))
+    weight = min(map_std**2 / (map_std**2 + variance), 2.0 * map_std / length if length > 0.0 else 1.0)
+    return CorrectedFlow(field, weight * residual)
+
+
+def predict_position(
+    position_um: Floats, sent_um_s: Floats, dt_s: float, delay_s: float, flow: CorrectedFlow
+) -> Floats:
+    """(2,) um: the robot after the delay, moved by the demands still on their way and by the flow.
+
+    `sent_um_s` (m, 2), oldest first, were sent one frame (dt_s) apart, the last of them a frame ago. A demand takes
+    effect one delay after it was sent.
+    """
+    point = np.array(position_um, np.float64)
+    elapsed = max(delay_s - len(sent_um_s) * dt_s, 0.0)  # before the first demand only the flow moves the robot
+    point = point + elapsed * flow.at(point)
+    for k in range(len(sent_um_s), 0, -1):
+        until = delay_s - (k - 1) * dt_s  # the demand sent k frames ago acts until its successor does
+        if until > elapsed:
+            point = point + (until - elapsed) * (sent_um_s[-k] + flow.at(point))
+            elapsed = until
+    return point
+
+
+def append_demand(sent_um_s: Floats, velocity_um_s: Floats, dt_s: float, delay_s: float) -> Floats:
+    """(m, 2) the demands with the newest appended, as many as are sent within a delay."""
+    count = min(int(np.ceil(delay_s / dt_s - 1e-9)) + 1, _MOST_DEMANDS) if dt_s > 0.0 else 1
+    return np.concatenate([sent_um_s, velocity_um_s[None]])[-count:]

@@ -6,12 +6,9 @@ import math
 from bisect import bisect_right
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Route
+from flowrec.core import Floats, Route
 from flowrec.stages.control.tracking_laws import Reference, Situation
-
-Vector = NDArray[np.float64]
 
 
 def follow(now: Situation, route: Route, lag_free_um: float, lag_full_um: float, pace_fraction: float) -> Reference:
@@ -44,7 +41,7 @@ def follow(now: Situation, route: Route, lag_free_um: float, lag_full_um: float,
     )
 
 
-def position_at(route: Route, time_s: float) -> Vector:
+def position_at(route: Route, time_s: float) -> Floats:
     """(2,) um: the route at a time since its start; its ends before and after."""
     # By bisection, because np.interp releases the interpreter lock on every call.
     after = bisect_right(route.arrival_s, time_s)
@@ -55,12 +52,12 @@ def position_at(route: Route, time_s: float) -> Vector:
     return np.asarray((1.0 - weight) * route.waypoints_um[after - 1] + weight * route.waypoints_um[after])
 
 
-def velocity_at(route: Route, time_s: float, over_s: float) -> Vector:
+def velocity_at(route: Route, time_s: float, over_s: float) -> Floats:
     """(2,) um/s: mean velocity along the route in the interval `over_s` after a time; zero at its end."""
     return (position_at(route, time_s + over_s) - position_at(route, time_s)) / over_s
 
 
-def nearest_time(route: Route, point_um: Vector) -> float:
+def nearest_time(route: Route, point_um: Floats) -> float:
     """Time (s) at which the route passes nearest to a point (2,) um; the first of several such times."""
     points = route.waypoints_um
     if len(points) < 2:
@@ -72,15 +69,15 @@ def nearest_time(route: Route, point_um: Vector) -> float:
     return float(route.arrival_s[k] + fraction[k] * (route.arrival_s[k + 1] - route.arrival_s[k]))
 
 
-def governed_pace(error_um: Vector, velocity_um_s: Vector, free_um: float, full_um: float) -> float:
+def governed_pace(error_um: Floats, velocity_um_s: Floats, free_um: float, full_um: float) -> float:
     """Factor on the planned pace of the reference: 1 without error, 0 when the robot is left behind.
 
     An error (reference minus robot, (2,)) sideways or behind slows the reference down, from `free_um` on until it
     stops at `full_um`. A robot that the flow has carried ahead by more than `free_um` speeds it up, to twice the pace
     at most, so that the robot is not driven back against the flow.
     """
-    speed = float(np.hypot(velocity_um_s[0], velocity_um_s[1]))
-    lag = math.hypot(error_um[0], error_um[1])
+    speed = float(np.hypot(*velocity_um_s))
+    lag = math.hypot(*error_um)
     ahead = 0.0
     if speed > 0.0:
         along = float(error_um @ velocity_um_s) / speed
@@ -91,7 +88,7 @@ def governed_pace(error_um: Vector, velocity_um_s: Vector, free_um: float, full_
     return slowdown * (1.0 + min(max((ahead - free_um) / full_um, 0.0), 1.0))
 
 
-def feasible_pace(velocity_um_s: Vector, flow_um_s: Vector, limit_um_s: float, most: float) -> float:
+def feasible_pace(velocity_um_s: Floats, flow_um_s: Floats, limit_um_s: float, most: float) -> float:
     """The largest factor p on a reference's velocity (2,) with which a robot in this flow can keep up.
 
     That is the largest p in 0..most with |p xd_dot - v| <= limit. Where there is none, it is the p that needs least

@@ -16,18 +16,17 @@ Step-out is detected as well, see step_out.py.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Range, Share, seconds
+from flowrec.core import Alarm, Applied, Estimate, Floats, FlowField, Health, Range, Share, seconds
 from flowrec.physics import Robot, sample
 from flowrec.stages.estimation.step_out import StepOut
 
-Floats = NDArray[np.float64]
 Resonators = NDArray[np.complex128]
 
 _BANK_HZ, _STEP, _ABOVE = 0.3, 1.125, 24  # of the bank: a frequency, the ratio of neighbours, how many from there on
@@ -107,7 +106,8 @@ class HealthMonitor:
         }
         active = previous.alarm.split("; ")
         alarms = [name for name, level in levels.items() if level > (self.ends_at if name in active else 1.0)]
-        now = Health(
+        now = replace(
+            previous,
             stamp_ns=estimate.stamp_ns,
             alarm="; ".join(alarms),
             nis=nis,
@@ -122,9 +122,7 @@ class HealthMonitor:
             mean_um_s=mean,
             offset_share=offset,
         )
-        if applied is None:
-            return now
-        return self.step_out.watch(previous, now, before, estimate, applied, field, robot, wall_um)
+        return now if applied is None else self.step_out.watch(now, before, estimate, applied, field, robot, wall_um)
 
     def _resonate(
         self, z: Resonators, power: Floats, deviation: float, dt: float, time_s: float
@@ -138,7 +136,7 @@ class HealthMonitor:
 
 def _flow_deviation(estimate: Estimate, expected_um_s: Floats, robot: Robot) -> float:
     """Deviation of the flow's strength from an expected flow (2,), relative to it; -1 to 1."""
-    speed = max(math.hypot(expected_um_s[0], expected_um_s[1]), _SLOW_FRACTION * robot.max_speed_um_s)
+    speed = max(math.hypot(*expected_um_s), _SLOW_FRACTION * robot.max_speed_um_s)
     deviation = float((estimate.flow_um_s - expected_um_s) @ expected_um_s) / speed**2
     return min(max(deviation, -1.0), 1.0)
 

@@ -23,11 +23,10 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowrec.core import Applied, Estimate, FlowField, Range, Share, Track, seconds
+from flowrec.core import Applied, Estimate, Floats, FlowField, Range, Share, Track, seconds
 from flowrec.physics import OBSERVER, Robot, sample
 from flowrec.stages.estimation.process_model import (
     ISOTROPIC,
-    Floats,
     StateLayout,
     gradient_at,
     process_noise,
@@ -105,7 +104,7 @@ class Kalman:
             if previous is not None:
                 weight = self._innovation_weight(robot, seconds(track.stamp_ns - previous.stamp_ns))
                 normal = innovation / math.sqrt(0.5 * (xx + yy))
-                size = math.hypot(normal[0], normal[1])
+                size = math.hypot(*normal)
                 surprise = surprise + weight * (min(1.0, _LARGEST_INNOVATION / max(size, 1e-9)) * normal - surprise)
             if nis <= self.gate_nis:
                 kalman.update(track.position_um)
@@ -157,15 +156,15 @@ class Kalman:
     ) -> Floats:
         """(n, n) covariance of the process noise of a step that changes the state by (n,)."""
         gain = (_GAIN_DRIFT * robot.um_per_rev) ** 2 * dt
+        share = 1.0 if field is None else OBSERVER.of(field, self.map_share) ** 2
         if self.flow_noise_um2_s3 is not None:
-            q = self.flow_noise_um2_s3 * (1.0 if field is None else OBSERVER.of(field, self.map_share) ** 2)
+            q = self.flow_noise_um2_s3 * share
             return process_noise(layout, dt, q * dt, 0.0, gain, self.drift_um2_s)
-        displacement = math.hypot(change[0], change[1]) + _REST_FRACTION * robot.max_speed_um_s * dt
+        displacement = math.hypot(*change[:2]) + _REST_FRACTION * robot.max_speed_um_s * dt
         flow = previous.flow_um_s
-        speed = math.hypot(flow[0], flow[1], _SLOWEST_FRACTION * robot.max_speed_um_s)
+        speed = math.hypot(*flow, _SLOWEST_FRACTION * robot.max_speed_um_s)
         unit = self.agility * self._noise_scale(previous, robot, dt) * displacement / robot.radius_um * speed**2
-        if field is not None:
-            unit *= OBSERVER.of(field, self.map_share) ** 2
+        unit *= share
         gradient = self.slope_change * unit / robot.radius_um**2
         return process_noise(layout, dt, self.flow_change * unit, gradient, gain, self.drift_um2_s)
 

@@ -7,15 +7,25 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Method, Methods, Share, Track, seconds
+from flowrec.core import (
+    Alarm,
+    Applied,
+    Estimate,
+    FlowField,
+    Health,
+    Method,
+    Methods,
+    Range,
+    Share,
+    Track,
+    seconds,
+)
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import Kalman, corrects_map, memory_s
-from flowrec.stages.estimation.luenberger import Luenberger
 
 _GIVEN_UP = 1.5  # times the deviation at which a map is taken up
-_KALMAN, _LUENBERGER = "flowrec.stages.estimation.kalman:Kalman", "flowrec.stages.estimation.luenberger:Luenberger"
+_KALMAN, _LUENBERGER = "flowrec.stages.estimation.kalman:Kalman", "flowrec.stages.estimation.observer:Luenberger"
 # The only option of a row is the section of its settings, an object of the class that implements it.
 OBSERVERS = Methods(
     "observer.method",
@@ -32,6 +42,54 @@ OBSERVERS = Methods(
     group="flowrec.observers",
     verb="estimate",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Luenberger:
+    """`luenberger`, the disturbance observer of the paper, eq. (19): d vhat/dt = L_p (dx/dt - d xhat/dt).
+
+    With xhat' = u + vhat it is a first-order low-pass filter of the measured drift, discretised exactly.
+    """
+
+    gain_per_s: Annotated[float, Range(1e-3, 1e4)] = 1.0  # L_p, the same on both axes
+    # one sigma, for the stated covariance only; None: 4 % of the radius
+    position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
+
+    def estimate(
+        self,
+        previous: Estimate | None,
+        track: Track,
+        applied: Applied,
+        robot: Robot,
+        field: FlowField | None = None,
+    ) -> Estimate:
+        """The position is the measured one; the covariance is nominal, that of filtered noise; `field` is not used."""
+        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius_um
+        moved = robot.um_per_rev * applied.turns
+        flow = np.zeros(2) if previous is None else previous.flow_um_s
+        position = track.position_um
+        dt = 0.0 if previous is None else seconds(track.stamp_ns - previous.stamp_ns)
+        # Weight of the newest drift.
+        weight = 1.0 - math.exp(-self.gain_per_s * dt) if dt > 0 else 0.0
+        if previous is not None and dt > 0:
+            if track.seen and previous.seen:
+                drift = (track.position_um - previous.measured_um - moved) / dt
+                flow = flow + weight * (drift - flow)
+            elif not track.seen:
+                position = previous.position_um + moved + flow * dt
+        # White noise of the positions, differenced over dt and filtered with the weight w, has the stationary variance
+        # 2 / (2 - w) (w sigma / dt)^2, which tends to (gain sigma)^2 for short dt.
+        per_s = weight / dt if dt > 0 else self.gain_per_s
+        flow_variance = 2.0 / (2.0 - weight) * (per_s * sigma_um) ** 2
+        return Estimate(
+            stamp_ns=track.stamp_ns,
+            position_um=position,
+            flow_um_s=flow,
+            covariance=np.diag([sigma_um**2, sigma_um**2, flow_variance, flow_variance]),
+            nis=float("nan"),
+            measured_um=track.position_um,
+            seen=track.seen,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +131,7 @@ class Observer:
         settings, needs = row.section(self), row.needs
         used = "map" in needs or ("good map" in needs and self._good(previous, field, health))
         estimate: Estimate = settings.estimate(previous, track, applied, robot, field if used else None)
-        return replace(estimate, rolled_um_s=_rolled_um_s(previous, estimate, applied, robot))
+        return _with_own_motion(previous, estimate, applied, robot)
 
     def without_map(
         self,
@@ -98,8 +156,7 @@ class Observer:
             return previous
         if before is not None:
             before = self.measured_estimate(previous, before)
-        now = self.kalman.estimate(before, track, applied, robot)
-        return replace(now, rolled_um_s=_rolled_um_s(before, now, applied, robot))
+        return _with_own_motion(before, self.kalman.estimate(before, track, applied, robot), applied, robot)
 
     @staticmethod
     def measured_estimate(mapless: Estimate | None, estimate: Estimate) -> Estimate:
@@ -121,13 +178,14 @@ class Observer:
         return Alarm.NIS not in health.alarm.split("; ") and abs(health.offset_share) <= most
 
 
-def _rolled_um_s(previous: Estimate | None, estimate: Estimate, applied: Applied, robot: Robot) -> NDArray[np.float64]:
-    """(2,) mean of the robot's own motion over the filter's memory, which is the delay of the estimated flow."""
+def _with_own_motion(previous: Estimate | None, estimate: Estimate, applied: Applied, robot: Robot) -> Estimate:
+    """The estimate with the robot's mean own motion over the filter's memory, which is the delay of its flow."""
     dt = 0.0 if previous is None else seconds(estimate.stamp_ns - previous.stamp_ns)
     if previous is None or dt <= 0.0:
-        return np.zeros(2) if previous is None else previous.rolled_um_s
+        return replace(estimate, rolled_um_s=np.zeros(2) if previous is None else previous.rolled_um_s)
     um_per_rev = robot.um_per_rev if estimate.um_per_rev is None else estimate.um_per_rev
     now = um_per_rev / dt * applied.turns
     before = previous.rolled_um_s if previous.rolled_um_s.size else now
     memory = memory_s(estimate.covariance)
-    return np.asarray(before + (1.0 - math.exp(-dt / memory) if memory > 0.0 else 1.0) * (now - before))
+    weight = 1.0 - math.exp(-dt / memory) if memory > 0.0 else 1.0
+    return replace(estimate, rolled_um_s=before + weight * (now - before))

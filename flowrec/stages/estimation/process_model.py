@@ -17,12 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowField
+from flowrec.core import Floats, FlowField
 from flowrec.physics import sample
-
-Floats = NDArray[np.float64]
 
 ISOTROPIC = np.array([0.5, 1.0, 1.0])  # relative variances of [sxx, sxy, syx] that do not depend on the axes
 

@@ -9,11 +9,10 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Estimate, Method, Methods, Observations, Range, Share, nanoseconds, seconds
+from flowrec.core import Estimate, Floats, Method, Methods, Observations, Range, Share, nanoseconds, seconds
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import lag_s, memory_s
 
-Floats = NDArray[np.float64]
 _OUTLIER_NIS = 25.0  # no observation is taken from an estimate whose measurement was less likely than this
 _EXTRA_POINTS = 2  # a polynomial needs more points than coefficients to state its scatter
 

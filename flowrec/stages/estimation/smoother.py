@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.core import NS_PER_S, Applied, Estimate, Observations, Track, seconds
+from flowrec.core import NS_PER_S, Applied, Estimate, Floats, Observations, Track, seconds
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import Kalman, memory_s, state_of
-from flowrec.stages.estimation.process_model import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

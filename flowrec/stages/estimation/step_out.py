@@ -66,7 +66,6 @@ class StepOut:
 
     def watch(
         self,
-        previous: Health,
         now: Health,
         before: Estimate,
         estimate: Estimate,
@@ -75,37 +74,30 @@ class StepOut:
         robot: Robot,
         wall_um: float = math.inf,
     ) -> Health:
-        """`now` with the fields of step-out after this frame.
+        """`now`, whose fields of step-out are those of the frame before, with those after this frame.
 
         Parameters
         ----------
-        previous, before : health and estimate of the frame before.
+        before : the estimate of the frame before.
         robot : as in the settings, without the limit.
         wall_um : from the robot's centre to the nearest wall, which may stop the robot.
         """
         own_hz = robot.step_out_margin * robot.step_out_hz
-        dt, turns = seconds(estimate.stamp_ns - before.stamp_ns), math.hypot(applied.turns[0], applied.turns[1])
-        limited_ns, rolled_before = previous.limited_ns, previous.rolled_before_um_s
-        now = replace(
-            now,
-            rolled_sums=previous.rolled_sums,
-            limit_hz=previous.limit_hz,
-            limited_ns=limited_ns,
-            rolled_before_um_s=rolled_before,
-        )
+        dt, turns = seconds(estimate.stamp_ns - before.stamp_ns), math.hypot(*applied.turns)
+        limited_ns, rolled_before = now.limited_ns, now.rolled_before_um_s
         if not estimate.seen:
             return replace(now, rolled_sums=_NONE)
         if field is None or dt <= 0.0 or turns <= 0.0 or not before.seen or wall_um < _FREE_RADII * robot.radius_um:
             return now
-        limit_hz = own_hz if previous.limit_hz is None else previous.limit_hz
+        limit_hz = own_hz if now.limit_hz is None else now.limit_hz
         if self.learned and turns < _FULL * limit_hz * dt:
             return now
         heading = applied.turns / turns
         carried = dt * sample(field, 0.5 * (before.measured_um + estimate.measured_um))
         rolled_um = float((estimate.measured_um - before.measured_um - carried) @ heading)
-        newest = np.array([rolled_um, robot.um_per_rev * turns, math.hypot(carried[0], carried[1]), dt])
+        newest = np.array([rolled_um, robot.um_per_rev * turns, math.hypot(*carried), dt])
         window_s = self._window_s(robot, dt)
-        sums = newest + math.exp(-dt / window_s) * (previous.rolled_sums if previous.rolled_sums.size else 0.0)
+        sums = newest + math.exp(-dt / window_s) * (now.rolled_sums if now.rolled_sums.size else 0.0)
         now = replace(now, rolled_sums=sums)
         time_s = float(sums[3])
         rolled, expected, carried_um_s = (sums[:3] / time_s).tolist()
@@ -115,9 +107,7 @@ class StepOut:
             if rolled - rolled_before[0] < _IMPROVEMENT * (rolled_before[1] - expected):
                 return replace(now, rolled_sums=_NONE, limit_hz=None, limited_ns=now.stamp_ns, rolled_before_um_s=_NONE)
             now = replace(now, rolled_before_um_s=_NONE)
-        waiting = (
-            previous.limit_hz is None and limited_ns is not None and seconds(now.stamp_ns - limited_ns) < self.wait_s
-        )
+        waiting = now.limit_hz is None and limited_ns is not None and seconds(now.stamp_ns - limited_ns) < self.wait_s
         lower_hz = max(self._lower_hz(rolled, expected, limit_hz, robot), self.floor_share * own_hz)
         explained = (
             expected - rolled <= STEP_OUT.of(field, self.map_error) * carried_um_s + self.missing_share * expected

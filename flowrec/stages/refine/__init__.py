@@ -5,8 +5,8 @@ assimilate: assimilation over several hypotheses, of which hypothesis is one; fl
 discretisation_error: what may be wrong with a flow; causes: with the observations; evidence, mixture_regression: what
 the observations say of it; mask_variants, obstacles: other walls; findings, report, uncertainty: what came out. case,
 local_viscosity, residuals, gauss_newton: a case without dimensions, its equations and their direct solution. network,
-network_inputs, network_fit, weights: what pi_unet, ni and unet share. pinn, collocation: the network of coordinates and
-its case. torch is imported when a method that needs it runs.
+network_inputs, network_fit, weights: what pi_unet, ni and unet share. pinn: the network of coordinates and its
+case. torch is imported when a method that needs it runs.
 """
 
 from flowrec.stages.refine.assimilate import Assimilate

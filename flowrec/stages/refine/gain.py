@@ -34,9 +34,7 @@ class Gain:
         factor, factor_std = _factor(predicted, operator.flow_um_s, variance, spread)
         speed = np.linalg.norm(assumed.velocity_um_s, axis=-1, keepdims=True)
         std = np.hypot(factor_std * assumed.velocity_um_s, spread * speed)
-        scores = None
-        if problem.hold_back:
-            scores = _scores(problem, predicted, variance, spread)
+        scores = _scores(problem, predicted, variance, spread) if problem.hold_back else None
         power = float((assumed.velocity_um_s.astype(np.float64) ** 2).sum())
         field = replace(
             assumed,
@@ -64,26 +62,27 @@ def _scores(problem: RefinementProblem, predicted: Floats, variance: Floats, spr
     held = blocks(which)
     if not held:
         return None
-    measured, square = operator.flow_um_s, (there**2).sum(axis=1)
+    measured = operator.flow_um_s
     before = _spread(there[which], measured[which], variance[which], 1.0)
     new, old = [], []
     for block in held:
         rest = np.setdiff1d(np.arange(operator.count), block)
-        factor, factor_std = _factor(predicted[rest], measured[rest], variance[rest], spread)
-        noise = np.repeat(variance[block] + spread**2 * (predicted[block] ** 2).sum(axis=1), 2)
-        own = predicted[block].ravel()
-        new.append(_ln_density(measured[block].ravel() - factor * own, noise, factor_std * own) / len(block))
-        noise = np.repeat(variance[block] + before**2 * square[block], 2)
-        left = (measured[block] - there[block]).ravel()
-        old.append(_ln_density(left, noise, np.zeros_like(left)) / len(block))
+        factor = _factor(predicted[rest], measured[rest], variance[rest], spread)
+        new.append(_block_score(predicted[block], measured[block], variance[block], spread, *factor))
+        old.append(_block_score(there[block], measured[block], variance[block], before, 1.0, 0.0))
     return Scores(np.array(new), np.array(old))
 
 
-def _ln_density(left: Floats, variance: Floats, shared: Floats) -> float:
-    """Ln of a normal density at `left` (n,): independent variances (n,) and one error that all share, by `shared`."""
-    inner = 1.0 + float((shared**2 / variance).sum())
-    misfit = float((left**2 / variance).sum()) - float((shared * left / variance).sum()) ** 2 / inner
-    return -0.5 * (misfit + float(np.log(2.0 * np.pi * variance).sum()) + float(np.log(inner)))
+def _block_score(
+    predicted: Floats, measured: Floats, variance: Floats, spread: float, factor: float, factor_std: float
+) -> float:
+    """Ln density per observation of flows (n, 2), with noise of variance (n,), a spread and a factor that all share."""
+    noise = np.repeat(variance + spread**2 * (predicted**2).sum(axis=1), 2)
+    own = predicted.ravel()
+    left, shared = measured.ravel() - factor * own, factor_std * own
+    inner = 1.0 + float((shared**2 / noise).sum())
+    misfit = float((left**2 / noise).sum()) - float((shared * left / noise).sum()) ** 2 / inner
+    return -0.5 * (misfit + float(np.log(2.0 * np.pi * noise).sum()) + float(np.log(inner))) / len(measured)
 
 
 def _factor(predicted: Floats, measured: Floats, variance: Floats, spread: float) -> tuple[float, float]:

@@ -22,12 +22,11 @@ from flowrec.stages.refine.observation_operator import TAIL, Floats
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
-    from torch.optim import Optimizer
-    from torch.optim.lr_scheduler import LambdaLR
 
     from flowrec.stages.refine.network_inputs import NetworkInputs
 
 Device = Literal["cpu", "cuda"]
+Iterations = Annotated[int, Range(1, 1_000_000)]
 
 
 @contextlib.contextmanager
@@ -60,8 +59,8 @@ def torch_run(device: Device, threads: int, seed: int, setting: str) -> Iterator
 
 def adam(
     parameters: Iterator[nn.Parameter], rate: float, steps: int, warm_up: float, lowest: float = 0.0
-) -> tuple[Optimizer, LambdaLR]:
-    """Adam whose rate rises over `warm_up` steps and falls as half a cosine to `lowest` of it."""
+) -> Callable[[Tensor], None]:
+    """A step down a loss by Adam, whose rate rises over `warm_up` steps and falls as half a cosine to `lowest`."""
     import torch
 
     optimiser = torch.optim.Adam(parameters, lr=rate)
@@ -69,7 +68,14 @@ def adam(
         optimiser,
         lambda i: min(1.0, (i + 1) / warm_up) * max(lowest, 0.5 * (1.0 + math.cos(math.pi * i / max(steps, 1)))),
     )
-    return optimiser, schedule
+
+    def step(loss: Tensor) -> None:
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+
+    return step
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +85,7 @@ class NetworkSettings:
     observations: Literal["soft", "hard"] = "soft"  # hard: as in the paper, the pixel takes the measured value
     # iterations times pixels in millions: larger fields get fewer iterations
     largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 4.0
-    patience: Annotated[int, Range(1, 1_000_000)] = 25  # iterations without a better loss before it stops
+    patience: Iterations = 25  # iterations without a better loss before it stops
     learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
     observation_weight: Weight = 0.03  # of the mean log-likelihood against the mean squared residual
     base_channels: Annotated[int, Range(1, 512)] = 16  # of the network with random weights
@@ -168,7 +174,7 @@ def fit_network(
     if start is None:
         with torch.no_grad():
             start = loss_of(net(image))[2]
-    optimiser, schedule = adam(net.parameters(), rate, steps, 0.1 * steps + 1e-9)
+    descend = adam(net.parameters(), rate, steps, 0.1 * steps + 1e-9)
     best, lowest, since = start, float("inf"), 0
     misfits: list[float] = []
     lowest_misfit = float("nan")
@@ -181,10 +187,7 @@ def fit_network(
             lowest, best, lowest_misfit = value, field.detach(), misfits[-1]
         if since > settings.patience:
             break
-        optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-        schedule.step()
+        descend(loss)
     image_of = np.moveaxis(best.cpu().numpy()[0].astype(np.float64), 0, -1)
     first = misfits[0] if misfits else float("nan")
     return NetworkFit(len(misfits), image_of[..., :2], image_of[..., 2], first, lowest_misfit)

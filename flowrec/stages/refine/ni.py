@@ -17,7 +17,7 @@ from flowrec.core import FlowField, Range, Weight
 from flowrec.physics import median_width_um
 from flowrec.stages.refine.case import Case
 from flowrec.stages.refine.method import RefinementProblem
-from flowrec.stages.refine.network_fit import FieldLoss, NetworkSettings, fit_network, torch_run
+from flowrec.stages.refine.network_fit import FieldLoss, Iterations, NetworkSettings, fit_network, torch_run
 from flowrec.stages.refine.observation_operator import RELATIVE_NOISE
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 class Ni(NetworkSettings):
     """Settings of N/I."""
 
-    iterations: Annotated[int, Range(1, 1_000_000)] = 150
+    iterations: Iterations = 150
     largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 6.0
-    patience: Annotated[int, Range(1, 1_000_000)] = 30
+    patience: Iterations = 30
     observation_weight: Weight = 0.1
 
     def fit(self, problem: RefinementProblem) -> FlowField:

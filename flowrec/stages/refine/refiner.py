@@ -7,7 +7,7 @@ one field of `Refiner` more, named in the row's options.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -79,8 +79,10 @@ def _untested_reason(operator: ObservationOperator, before: FlowField | None) ->
 
 def keep_flow(in_use: FlowField, why: str, refused: FlowField | None = None) -> FlowField:
     """The flow in use with the reason why another is refused, and with the scores of that one where it has any."""
-    scores = [getattr(refused, name, None) for name in ("log_score", "log_score_before", "log_score_error")]
-    return replace(in_use, refused=why, log_score=scores[0], log_score_before=scores[1], log_score_error=scores[2])
+    scores: dict[str, Any] = {
+        name: getattr(refused, name, None) for name in ("log_score", "log_score_before", "log_score_error")
+    }
+    return replace(in_use, refused=why, **scores)
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,10 +52,9 @@ def read_weights(path: Path, network: nn.Module) -> None:
         raise FlowError(f"{path}: not a sound safetensors file ({error}); train the weights anew") from error
     wanted: dict[str, Tensor] = network.state_dict()
     for name in sorted(wanted.keys() | stored.keys()):
-        if name not in stored:
-            raise FlowError(f"{path}: no tensor '{name}'; these weights are of another network")
-        if name not in wanted:
-            raise FlowError(f"{path}: unknown tensor '{name}'; these weights are of another network")
+        if name not in stored or name not in wanted:
+            fault = "unknown" if name in stored else "no"
+            raise FlowError(f"{path}: {fault} tensor '{name}'; these weights are of another network")
         if stored[name].shape != wanted[name].shape:
             shapes = f"{tuple(stored[name].shape)}, not {tuple(wanted[name].shape)}"
             raise FlowError(f"{path}: tensor '{name}' is {shapes}; these weights are of another network")

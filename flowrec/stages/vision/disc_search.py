@@ -36,15 +36,6 @@ class Disc:
 
 
 @dataclass(frozen=True, slots=True)
-class DiscLimits:
-    """The tracker's settings of these names."""
-
-    least_contrast: float  # grey levels
-    size_tolerance: float  # one sigma of ln(measured radius / expected radius)
-    candidates: int  # largest number of fitted discs
-
-
-@dataclass(frozen=True, slots=True)
 class DiscSearch:
     """Area of the search for discs, and the least similarity to the robot. Lengths in camera pixels."""
 
@@ -56,7 +47,9 @@ class DiscSearch:
     margin_px: float
     least_score: float
     least_likeness: float
-    limits: DiscLimits
+    least_contrast: float  # grey levels
+    size_tolerance: float  # one sigma of ln(measured radius / expected radius)
+    candidates: int  # largest number of fitted discs
     slack_px: float = 0.0  # the walls may be off by this much
 
 
@@ -79,7 +72,7 @@ def best_disc(image: Image | NDArray[np.float32], walls: Walls, search: DiscSear
         match = np.where(distance2 <= 1.0, match - np.float32(_DISTANCE_PENALTY) * distance2, np.float32(-1.0))
     best, best_rank = None, 0.0
     suppressed = max(1, round(nominal / step))  # around a candidate
-    for _ in range(search.limits.candidates):
+    for _ in range(search.candidates):
         row, column = divmod(int(match.argmax()), columns)
         if match[row, column] < _LEAST_CORRELATION:
             break
@@ -106,11 +99,11 @@ def _measure(image: Image | NDArray[np.float32], walls: Walls, x: float, y: floa
     fx, fy, radius_px, darkness, likeness = fit_disc(
         image, walls.distance_px, search.margin_px, x, y, expected, initial_edge_px(expected), step
     )
-    if darkness < search.limits.least_contrast or math.hypot(fx - x, fy - y) > max(1.2 * expected, 2.0):
+    if darkness < search.least_contrast or math.hypot(fx - x, fy - y) > max(1.2 * expected, 2.0):
         return None
     if walls.distance_px[nearest_pixel(fx, fy, image.shape)] < 0.6 * search.nominal_px - search.slack_px:
         return None
-    size = math.log(radius_px / expected) / math.hypot(search.limits.size_tolerance, _SIZE_PX / expected)
+    size = math.log(radius_px / expected) / math.hypot(search.size_tolerance, _SIZE_PX / expected)
     return Disc(fx, fy, radius_px, darkness, likeness, likeness * math.exp(-0.5 * size * size))
 
 

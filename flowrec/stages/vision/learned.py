@@ -25,7 +25,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Appearance, Image, Track
+from flowrec.core import Appearance, Floats, Image, Track
 from flowrec.stages.vision.foreground import (
     WINDOW,
     correlation,
@@ -37,16 +37,16 @@ from flowrec.stages.vision.foreground import (
     register_view,
     silhouette_centroid,
 )
-from flowrec.stages.vision.walls import Box
+from flowrec.stages.vision.walls import Box, Walls
 
 SIGNS = {"dark": -1, "bright": 1, "mixed": 0}
 BLUR_PX = 1.0  # an image is larger than the object by about this much
 LEAST_RADIUS_PX = 3.2  # of an image: less holds too few pixels
 VIEWS = 8  # at most
+_UPDATE_NS = 100_000_000  # least time between two updates of a known look
 _STEP_RADIUS_PX = 6.0  # least radius in the reduced image
-_CENTROID_RADII = 1.15  # window of the centroid
+CENTROID_RADII = 1.15  # window of the centroid
 _LEAST_ENERGY = 3.0  # of a candidate, in units of the noise's variance
-_LEAST_ENERGY_SHARE = 0.05  # and relative to the robot's
 _NEAR, _ALL = 12, 64  # candidates that are measured near the robot, and in a whole image
 _SIMILARITY_COST, _MOTION_COST, _MISSED_COST, _IMPOSSIBLE = 8.0, 1.5, 9.0, 1e3
 _NEIGHBOUR_MISSED_COST = 6.0
@@ -129,24 +129,46 @@ class ForegroundRegion:
     y0: float
     scale: ReducedScale
 
-    def to_px(self, blocks: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_px(self, blocks: Floats) -> Floats:
         """Points (..., 2) in blocks to camera pixels."""
         return np.asarray(blocks * self.scale.step + np.array([self.x0, self.y0]))
 
-    def to_blocks(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_blocks(self, points_px: Floats) -> Floats:
         """Points (..., 2) in camera pixels to blocks."""
         return np.asarray((points_px - np.array([self.x0, self.y0])) / self.scale.step)
 
 
-def region_of(
-    image: Image, distance_px: NDArray[np.float32], box: Box, scale: ReducedScale, solid_px: float
-) -> ForegroundRegion:
-    """The foreground of a box; pixels deeper in the solid than -solid_px are left out."""
-    x0, y0, x1, y1 = box
-    step = scale.step
-    columns, rows = -(-(x1 - x0) // step), -(-(y1 - y0) // step)
-    c = reduced_foreground(image, distance_px, x0, y0, columns, rows, step, scale.background, solid_px)
-    return ForegroundRegion(c, x0 + 0.5 * (step - 1), y0 + 0.5 * (step - 1), scale)
+@dataclass(frozen=True, slots=True)
+class View:
+    """An image with the walls in it.
+
+    Attributes
+    ----------
+    radius_px : of the robot.
+    solid_px : distance to the mask's walls (negative: depth in the solid) from which on a pixel may show fluid.
+    """
+
+    image: Image
+    walls: Walls
+    radius_px: float
+    solid_px: float
+
+    def around(self, box: Box, scale: ReducedScale) -> ForegroundRegion:
+        """The foreground of a box and a margin, in which objects on its border are whole."""
+        m = scale.margin_px
+        return self._region((box[0] - m, box[1] - m, box[2] + m, box[3] + m), scale)
+
+    def whole(self, scale: ReducedScale) -> ForegroundRegion:
+        """The foreground of the whole image."""
+        height, width = self.image.shape
+        return self._region((0, 0, width, height), scale)
+
+    def _region(self, box: Box, scale: ReducedScale) -> ForegroundRegion:
+        x0, y0, x1, y1 = box
+        step, distance_px = scale.step, self.walls.distance_px
+        columns, rows = -(-(x1 - x0) // step), -(-(y1 - y0) // step)
+        c = reduced_foreground(self.image, distance_px, x0, y0, columns, rows, step, scale.background, self.solid_px)
+        return ForegroundRegion(c, x0 + 0.5 * (step - 1), y0 + 0.5 * (step - 1), scale)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,24 +182,24 @@ class Candidates:
     view : (n,) most similar view, and `similarity` (n,) its correlation, at `start` (n, 2), in blocks.
     """
 
-    blocks: NDArray[np.float64]
-    px: NDArray[np.float64]
-    energy: NDArray[np.float64]
+    blocks: Floats
+    px: Floats
+    energy: Floats
     view: NDArray[np.intp]
-    similarity: NDArray[np.float64]
-    start: NDArray[np.float64]
+    similarity: Floats
+    start: Floats
 
 
 def candidates(
-    region: ForegroundRegion,
-    appearance: Appearance,
-    box: Box,
-    distance_px: NDArray[np.float32],
-    least_energy: float,
-    near_px: NDArray[np.float64] | None,
-) -> Candidates:
-    """Objects centred in a box and in the fluid: those nearest to a point, or without one those of most energy."""
-    scale, sign, noise = region.scale, SIGNS[appearance.polarity], appearance.foreground_noise
+    view: View, appearance: Appearance, box: Box, least_energy: float, near_px: Floats | None
+) -> tuple[ForegroundRegion, Candidates]:
+    """The foreground of a box, and the objects centred there in the fluid.
+
+    They are those nearest to a point, or without one those of most energy.
+    """
+    scale, distance_px = ReducedScale(appearance.radius_px), view.walls.distance_px
+    region = view.around(box, scale)
+    sign, noise = SIGNS[appearance.polarity], appearance.foreground_noise
     energy = energy_map(region.c, noise, sign, scale.energy)
     found = peaks(energy, max(least_energy, _LEAST_ENERGY), scale.apart, 4 * _ALL)
     if near_px is not None:
@@ -187,7 +209,7 @@ def candidates(
     height, width = distance_px.shape
     measured: list[tuple[float, float, float, int, float, float, float]] = []
     for column, row, _ in found[:_ALL].tolist():
-        x, y, e, _ = silhouette_centroid(region.c, noise, sign, column, row, _CENTROID_RADII * scale.radius, 6)
+        x, y, e, _ = silhouette_centroid(region.c, noise, sign, column, row, CENTROID_RADII * scale.radius, 6)
         px, py = (region.x0 + scale.step * x, region.y0 + scale.step * y)
         if not (box[0] - 0.5 <= px < box[2] + 0.5 and box[1] - 0.5 <= py < box[3] + 0.5) or e <= 0.0:
             continue
@@ -196,35 +218,40 @@ def candidates(
             continue
         if any(math.hypot(x - other[0], y - other[1]) < 0.7 * scale.radius for other in measured):
             continue
-        view, similarity, di, dj = most_similar(region.c, x, y, appearance.views, window, 1)
-        measured.append((x, y, e, view, similarity, round(x) + di, round(y) + dj))
+        number, similarity, di, dj = most_similar(region.c, x, y, appearance.views, window, 1)
+        measured.append((x, y, e, number, similarity, round(x) + di, round(y) + dj))
     table = np.array(measured, np.float64).reshape(-1, 7)
     blocks = table[:, :2]
-    return Candidates(blocks, region.to_px(blocks), table[:, 2], table[:, 3].astype(np.intp), table[:, 4], table[:, 5:])
+    numbers = table[:, 3].astype(np.intp)
+    return region, Candidates(blocks, region.to_px(blocks), table[:, 2], numbers, table[:, 4], table[:, 5:])
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedMotion:
-    """Expected position of the robot."""
+    """Expected position of the robot, after a track whose place was `place_px` (2,)."""
 
-    expected_px: NDArray[np.float64]  # (2,)
+    previous: Track
+    place_px: Floats
+    radius_px: float
+    frame_s: float  # since that track
+    expected_px: Floats  # (2,)
     spread_px: float  # typical distance from there
 
+    @classmethod
+    def after(cls, previous: Track, place_px: Floats, radius_px: float, frame_s: float) -> ExpectedMotion:
+        """The motion since a track: its velocity goes on for three frames at most, then it may be anywhere near."""
+        frames = 1 + previous.lost_frames
+        moved = previous.velocity_px_s * frame_s * frames if previous.lost_frames < _EXPECTED_FRAMES else 0.0
+        spread_px = max(previous.spread_px, 0.15 * radius_px + 0.3) * frames
+        return cls(previous, place_px, radius_px, frame_s, place_px + moved, spread_px)
 
-def expected_motion(previous: Track, place_px: NDArray[np.float64], radius_px: float, frame_s: float) -> ExpectedMotion:
-    """The motion since a track: its velocity goes on for three frames at most, then the robot may be anywhere near."""
-    frames = 1 + previous.lost_frames
-    moved = previous.velocity_px_s * frame_s * frames if previous.lost_frames < _EXPECTED_FRAMES else 0.0
-    return ExpectedMotion(place_px + moved, max(previous.spread_px, 0.15 * radius_px + 0.3) * frames)
 
-
-def assign_objects(
-    found: Candidates, previous: Track, motion: ExpectedMotion, range_px: float
-) -> tuple[int | None, NDArray[np.float64]]:
+def assign_objects(found: Candidates, motion: ExpectedMotion, range_px: float) -> tuple[int | None, Floats]:
     """The candidate that is the robot when all objects of the frame before are assigned at once; None: no one is.
 
     Besides the neighbours (k, 3) that are no candidate.
     """
+    previous = motion.previous
     count = len(found.energy)
     neighbours = previous.neighbours_px.reshape(-1, 3)
     if not count:
@@ -247,29 +274,18 @@ def assign_objects(
     return (int(chosen[0]) if chosen[0] < count else None), missed
 
 
-@dataclass(frozen=True, slots=True)
-class Merged:
-    """The robot and neighbours (k, 3) in one image."""
-
-    which: int
-    place_px: NDArray[np.float64]  # (2,) of the robot
-    neighbours: NDArray[np.float64]
-
-
 def find_merged(
-    found: Candidates,
-    which: int | None,
-    previous: Track,
-    motion: ExpectedMotion,
-    missed: NDArray[np.float64],
-    radius_px: float,
-) -> Merged | None:
+    found: Candidates, which: int | None, motion: ExpectedMotion, missed: Floats
+) -> tuple[int, Floats, Floats] | None:
     """The image that is the robot and missed neighbours (k, 3) together: it is near both and has the sum of energies.
+
+    Its number, and in px the place (2,) of the robot and those neighbours (k, 3); None: there is no such image.
 
     `which` is the candidate that is the robot; None: the one nearest to where it is expected, which then may be taken
     for a neighbour. Its centroid is that of all, and they lie to each other as before:
         centroid = sum(E_i p_i) / sum(E_i), p_robot - p_i = expected - p_i before.
     """
+    previous, radius_px = motion.previous, motion.radius_px
     if which is None:
         if not len(found.energy) or previous.lost_frames >= _EXPECTED_FRAMES:
             return None
@@ -287,12 +303,10 @@ def find_merged(
         return None
     offsets = motion.expected_px - near[:, :2]
     place_px = centroid + (near[:, 2:] * offsets).sum(axis=0) / total
-    return Merged(which, place_px, np.column_stack([place_px - offsets, near[:, 2]]))
+    return which, place_px, np.column_stack([place_px - offsets, near[:, 2]])
 
 
-def hidden_neighbours(
-    missed: NDArray[np.float64], place_px: NDArray[np.float64], radius_px: float
-) -> NDArray[np.float64]:
+def hidden_neighbours(missed: Floats, place_px: Floats, radius_px: float) -> Floats:
     """Those of the missed neighbours (k, 3) that are at the robot's place: they may come out of its image again.
 
     They fade, since one that has gone out of focus does not come out.
@@ -302,19 +316,17 @@ def hidden_neighbours(
     return np.column_stack([kept[:, :2], _FADE * kept[:, 2]])
 
 
-def _move_cost(
-    found: Candidates, motion: ExpectedMotion, distance2: NDArray[np.float64], energy: float
-) -> NDArray[np.float64]:
+def _move_cost(found: Candidates, motion: ExpectedMotion, distance2: Floats, energy: float) -> Floats:
     """Cost (n,) of a move and of a change of energy: a heavy tail, because robots and neighbours jump at times."""
     changed = np.abs(np.log(found.energy / max(energy, 1e-6)))
     return np.asarray(_MOTION_COST * np.log1p(distance2 / motion.spread_px**2) + changed)
 
 
-def similar(found: Candidates, which: int, previous: Track, motion: ExpectedMotion, radius_px: float) -> bool:
+def similar(found: Candidates, which: int, motion: ExpectedMotion) -> bool:
     """True if a candidate of unknown look is the robot by its place and energy: it has turned."""
-    ratio = float(found.energy[which]) / max(previous.energy, 1e-6)
-    near = math.dist(found.px[which], motion.expected_px) < 1.5 * radius_px
-    return previous.lost_frames < _EXPECTED_FRAMES and near and 0.25 < ratio < 4.0
+    ratio = float(found.energy[which]) / max(motion.previous.energy, 1e-6)
+    near = math.dist(found.px[which], motion.expected_px) < 1.5 * motion.radius_px
+    return motion.previous.lost_frames < _EXPECTED_FRAMES and near and 0.25 < ratio < 4.0
 
 
 def alone(found: Candidates, energy: float, least_score: float) -> int | None:
@@ -332,63 +344,56 @@ def alone(found: Candidates, energy: float, least_score: float) -> int | None:
 
 def locate_robot(
     region: ForegroundRegion, found: Candidates, which: int, appearance: Appearance
-) -> tuple[NDArray[np.float64], float]:
+) -> tuple[Floats, float]:
     """Position (2,) of a candidate in blocks, and its similarity."""
-    scale, window = region.scale, region.scale.window()
-    view = appearance.views[found.view[which]]
+    window, view = region.scale.window(), appearance.views[found.view[which]]
     centroid, similarity = found.blocks[which], float(found.similarity[which])
     start_x, start_y = found.start[which].tolist()
     x, y, correlated = register_view(region.c, start_x, start_y, view, window, 1.5)
     half = view.shape[0] // 2
-    sign, radius = SIGNS[appearance.polarity], _CENTROID_RADII * scale.radius
-    ax, ay, _, _ = silhouette_centroid(view, appearance.foreground_noise, sign, float(half), float(half), radius, 6)
+    ax, ay, _, _ = centroid_of(view, appearance, 6)
     registration = np.array([x + ax - half, y + ay - half])
     # A registration with another look of an object that is not round slides along it.
     round_share = min(max((correlation(view, np.ascontiguousarray(view.T[::-1]), window) - 0.6) / 0.3, 0.0), 1.0)
     weight = round_share * min(max((correlated - 0.7) / 0.2, 0.0), 1.0)
-    if math.dist(registration, centroid) > 0.7 * scale.radius:
+    if math.dist(registration, centroid) > 0.7 * region.scale.radius:
         weight = 0.0
     return weight * registration + (1.0 - weight) * centroid, max(similarity, correlated)
 
 
-def updated_views(
-    region: ForegroundRegion,
-    place: NDArray[np.float64],
-    appearance: Appearance,
-    similarity: float,
-    isolated: bool,
-    due: bool,
-) -> NDArray[np.float32] | None:
-    """The views with the present look in them; None if they stay."""
+def centroid_of(view: NDArray[np.float32], appearance: Appearance, moves: int) -> tuple[float, float, float, float]:
+    """The `silhouette_centroid` of a view, which follows it from the middle of the view on."""
+    middle, radius = float(view.shape[0] // 2), ReducedScale(appearance.radius_px).radius
+    sign, noise = SIGNS[appearance.polarity], appearance.foreground_noise
+    return silhouette_centroid(view, noise, sign, middle, middle, CENTROID_RADII * radius, moves)
+
+
+def updated_look(
+    region: ForegroundRegion, place: Floats, appearance: Appearance, similarity: float, isolated: bool, stamp_ns: int
+) -> Appearance:
+    """The appearance with the present look in it; itself if it stays."""
     views, half = appearance.views, appearance.views.shape[1] // 2
-    if not isolated and similarity < 0.9:
-        return None
     known = similarity >= _KNOWN_LOOK
-    if known and not due:
-        return None
+    if (not isolated and similarity < 0.9) or (known and stamp_ns - appearance.stamp_ns < _UPDATE_NS):
+        return appearance
     x, y = place.tolist()
     patch = patch_at(region.c, x, y, half)
     if len(views) == 1:
-        return np.stack([views[0], patch])
-    if known:
+        views = np.stack([views[0], patch])
+    elif known:
         recent = views[1] + np.float32(_RECENT_GAIN) * (patch - views[1])
-        return np.concatenate([views[:1], recent[None], views[2:]])
-    older = views[1:] if len(views) < VIEWS else np.concatenate([views[1:2], views[3:]])
-    return np.concatenate([views[:1], patch[None], older])
+        views = np.concatenate([views[:1], recent[None], views[2:]])
+    else:
+        older = views[1:] if len(views) < VIEWS else np.concatenate([views[1:2], views[3:]])
+        views = np.concatenate([views[:1], patch[None], older])
+    return replace(appearance, stamp_ns=stamp_ns, views=views)
 
 
-def with_motion(
-    track: Track,
-    previous: Track,
-    motion: ExpectedMotion,
-    place_px: NDArray[np.float64],
-    to_px: NDArray[np.float64],
-    energy: float,
-    dt: float,
-) -> Track:
-    """The track with its fields on the motion, after the robot went from one place to another in `dt` seconds."""
+def with_motion(track: Track, motion: ExpectedMotion, to_px: Floats, energy: float) -> Track:
+    """The track with its fields on the motion, after the robot went to a place (2,)."""
+    previous, dt = motion.previous, motion.frame_s
     frames = 1 + previous.lost_frames
-    velocity = (to_px - place_px) / (dt * frames) if dt > 0.0 else previous.velocity_px_s
+    velocity = (to_px - motion.place_px) / (dt * frames) if dt > 0.0 else previous.velocity_px_s
     missed_px = math.dist(to_px, motion.expected_px) / frames
     ratio = max(energy, 1e-6) / max(previous.energy, 1e-6)
     return replace(
@@ -399,13 +404,13 @@ def with_motion(
     )
 
 
-def neighbours_of(found: Candidates, robot: int | None) -> NDArray[np.float64]:
+def neighbours_of(found: Candidates, robot: int | None) -> Floats:
     """Place and energy (3 k,) of all candidates but the robot."""
     rows = np.column_stack((found.px, found.energy))
-    return np.asarray(np.delete(rows, robot, axis=0).ravel() if robot is not None else rows.ravel())
+    return np.delete(rows, [] if robot is None else robot, axis=0).ravel()
 
 
-def is_isolated(neighbours_px: NDArray[np.float64], place_px: NDArray[np.float64], radius_px: float) -> bool:
+def is_isolated(neighbours_px: Floats, place_px: Floats, radius_px: float) -> bool:
     """True if no neighbour is so near that it is in the robot's views."""
     offsets = neighbours_px.reshape(-1, 3)[:, :2] - place_px
     return not len(offsets) or float(np.hypot(*offsets.T).min()) > _ISOLATED_RADII * radius_px

@@ -20,12 +20,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Background, Frame, Image, Range, Shift, Track
+from flowrec.core import NS_PER_S, Background, Floats, Frame, Image, Range, Shift, Track
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.learning import pixel_noise
 from flowrec.stages.vision.walls import walls_in_view
 
-Floats = NDArray[np.float64]
 _Pixel = Annotated[float, Range(-1e3, 1e3)]
 _TILE_PX, _PER_TILE = 32, 8  # so that the pixels are spread over the image
 _BORDER_PX = 4  # pixels nearer to the border would leave the image with most shifts

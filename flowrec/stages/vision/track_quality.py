@@ -15,9 +15,8 @@ import math
 from array import array
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Appearance, Shift, Tick, Track, seconds, shift_px
+from flowrec.core import Appearance, Floats, Shift, Tick, Track, seconds, shift_px
 from flowrec.physics import Calibration, Robot
 from flowrec.stages.vision.foreground import correlation
 from flowrec.stages.vision.learned import ReducedScale
@@ -53,7 +52,7 @@ class TrackQuality:
     def __init__(self, calibration: Calibration, image_shape: tuple[int, int], robot: Robot) -> None:
         self._calibration, self._image_shape, self._robot = calibration, image_shape, robot
         self._last: Track | None = None
-        self._velocity: tuple[float, float] | None = None  # um/s, between the last two places
+        self._velocity: Floats | None = None  # um/s, between the last two places
         self._appearance: Appearance | None = None
         self._energy: tuple[float, float] | None = None  # at the beginning and now
         self._count = self._cut = self._rivals = 0
@@ -86,17 +85,14 @@ class TrackQuality:
         if last is None:
             return
         step_s = seconds(track.stamp_ns - last.stamp_ns)
-        moved = track.position_um - last.position_um
-        x, y = moved.tolist()
-        off_x, off_y = x, y
+        moved_um = off_um = track.position_um - last.position_um
         if self._velocity is not None and len(self._steps_s):
-            goes_on_s = min(step_s, _GOES_ON_FRAMES * self._steps_s[-1])
-            off_x, off_y = x - self._velocity[0] * goes_on_s, y - self._velocity[1] * goes_on_s
+            off_um = moved_um - self._velocity * min(step_s, _GOES_ON_FRAMES * self._steps_s[-1])
         self._steps_s.append(step_s)
-        self._steps_um.append(math.hypot(x, y))
-        self._off_um.append(math.hypot(off_x, off_y))
+        self._steps_um.append(math.hypot(*moved_um))
+        self._off_um.append(math.hypot(*off_um))
         self._at_s.append(seconds(track.stamp_ns))
-        self._velocity = (x / step_s, y / step_s)
+        self._velocity = moved_um / step_s
 
     def doubts(self) -> list[str]:
         """Reasons why the track is doubtful, for people; empty if there are none."""
@@ -151,7 +147,7 @@ class TrackQuality:
         return f"{count} of {self._count} images"
 
 
-def _has_rival(track: Track, place_px: NDArray[np.float64]) -> bool:
+def _has_rival(track: Track, place_px: Floats) -> bool:
     """True if another body of like energy is where the robot may be as well."""
     others = track.neighbours_px.reshape(-1, 3)
     if not len(others) or track.energy <= 0.0:

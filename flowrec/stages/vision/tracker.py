@@ -17,14 +17,12 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Appearance, Frame, Range, Share, Track, seconds
+from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, seconds
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.disc_search import (
     LARGEST,
     Disc,
-    DiscLimits,
     DiscSearch,
     best_disc,
     best_disc_normalised,
@@ -33,20 +31,18 @@ from flowrec.stages.vision.disc_search import (
 from flowrec.stages.vision.learned import (
     Candidates,
     ExpectedMotion,
-    ReducedScale,
+    View,
     alone,
     assign_objects,
     candidates,
-    expected_motion,
     find_merged,
     hidden_neighbours,
     is_isolated,
     locate_robot,
     neighbours_of,
-    region_of,
     scale_of,
     similar,
-    updated_views,
+    updated_look,
     with_motion,
 )
 from flowrec.stages.vision.learning import box_of, brightest_spot, energy_of, learn, pixel_noise
@@ -59,7 +55,6 @@ _SMALLEST = 0.75  # least expected radius relative to the robot's own
 _RADIUS_WEIGHT = 0.05  # of the newest radius in the tracked one: focus drifts, single frames are unreliable
 _LENIENT_SCORE, _LENIENT_LIKENESS = 0.85, 0.9  # of a disc that may be pale or beside a wall: debris has less
 _ENERGY_SHARE = 0.05  # least energy of a candidate relative to the robot's
-_UPDATE_NS = 100_000_000  # least time between two updates of a known look
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +69,33 @@ class Footprint:
 class _Scene:
     """An image and what is known about it."""
 
+    previous: Track | None
     frame: Frame
     walls: Walls
     calibration: Calibration
     robot: Robot
+
+    def track(self, search: DiscSearch, found: Disc | None) -> Track:
+        """The track of a disc. Where there is none the last place stays, before the first the middle of the image."""
+        previous, radius_px = self.previous, search.expected_px
+        if found is not None:
+            place_um, score, lost = self.calibration.to_um((found.x, found.y)), found.score, 0
+            radius_px += _RADIUS_WEIGHT * (found.radius_px - radius_px)
+            radius_px = min(max(radius_px, _SMALLEST * search.nominal_px), LARGEST * search.nominal_px)
+        elif previous is not None:
+            place_um, score, lost = previous.position_um, previous.score, previous.lost_frames + 1
+        else:
+            height, width = self.frame.image.shape
+            place_um, score, lost = self.calibration.to_um(((width - 1) / 2, (height - 1) / 2)), 0.0, 1
+        return Track(
+            stamp_ns=self.frame.stamp_ns,
+            seen=found is not None,
+            position_um=place_um,
+            score=score,
+            lost_frames=lost,
+            radius_px=radius_px,
+            roi_px=np.array(search.box, np.float64),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,28 +170,26 @@ class Tracker:
             return self._other.track(previous, frame, chip, moved, robot), None
         if self.polarity is None:
             return self.track(previous, frame, chip, calibration, robot), None
-        walls = walls_in_view(chip, calibration, (frame.image.shape[0], frame.image.shape[1]))
+        walls = walls_in_view(chip, calibration, frame.image.shape)
         if any(shift_px):
             walls, calibration = walls.for_shift(shift_px), calibration.for_shift(shift_px)
-        scene = _Scene(frame, walls, calibration, robot)
+        scene = _Scene(previous, frame, walls, calibration, robot)
         if appearance is None:
-            return self._first_look(previous, scene)
+            return self._first_look(scene)
         if appearance.note:
-            return _not_seen(previous, scene, self._everywhere(previous, scene)), appearance
+            return scene.track(self._plan(scene, everywhere=True), None), appearance
         if len(appearance.views):
             assert previous is not None, "the robot was seen when its look was learned"
             return self._follow_learned(previous, appearance, scene)
-        search = self._plan(previous, frame, walls, calibration, robot)
-        found = self._dark_disc(scene, search, appearance.noise)
-        return (_not_seen(previous, scene, search) if found is None else _seen_track(scene, search, found)), appearance
+        search = self._plan(scene)
+        return scene.track(search, self._dark_disc(scene, search, appearance.noise)), appearance
 
     def track(self, previous: Track | None, frame: Frame, chip: Chip, calibration: Calibration, robot: Robot) -> Track:
         """The dark disc in this frame; `seen` False keeps the last position (the image's centre before the first)."""
-        walls = walls_in_view(chip, calibration, (frame.image.shape[0], frame.image.shape[1]))
-        scene = _Scene(frame, walls, calibration, robot)
-        search = self._plan(previous, frame, walls, calibration, robot)
-        found = best_disc(frame.image, walls, search)
-        return _not_seen(previous, scene, search) if found is None else _seen_track(scene, search, found)
+        walls = walls_in_view(chip, calibration, frame.image.shape)
+        scene = _Scene(previous, frame, walls, calibration, robot)
+        search = self._plan(scene)
+        return scene.track(search, best_disc(frame.image, walls, search))
 
     def footprint(self, chip: Chip, calibration: Calibration, robot: Robot, shape: tuple[int, int]) -> Footprint:
         """The pixels of an image of `shape` that can influence a track, whatever the image shows."""
@@ -181,62 +197,52 @@ class Tracker:
             return Footprint(max(shape), (0, 0, shape[1], shape[0]))
         pad_px = disc_pad_px(robot.radius_um / calibration.um_per_px)
         if self.polarity is not None:
-            pad_px = max(pad_px, scale_of(self._radius_px(calibration, robot)).pad_px)
+            pad_px = max(pad_px, scale_of(self._radius_px(calibration.um_per_px, robot)).pad_px)
         return Footprint(pad_px, walls_in_view(chip, calibration, shape).box)
 
-    def _radius_px(self, calibration: Calibration, robot: Robot) -> float:
+    def _radius_px(self, um_per_px: float, robot: Robot) -> float:
         """Radius of what is learned: that of the user's box, or the robot's."""
-        return robot.radius_um / calibration.um_per_px if self.box_px is None else max(box_of(self.box_px)[1], 1.0)
+        return robot.radius_um / um_per_px if self.box_px is None else max(box_of(self.box_px)[1], 1.0)
 
-    def _first_look(self, previous: Track | None, scene: _Scene) -> tuple[Track, Appearance | None]:
+    def _first_look(self, scene: _Scene) -> tuple[Track, Appearance | None]:
         """Find a robot of unknown look; its appearance is None until it is seen."""
         frame, assumed = scene.frame, self.polarity or "dark"
-        search = self._everywhere(previous, scene)
-        if self.click_px is not None or self.box_px is not None:
+        search = self._plan(scene, everywhere=True)
+        at_px = self.click_px if self.box_px is None else box_of(self.box_px)[0]
+        if at_px is not None:
             if self.click_frame is not None and frame.index < self.click_frame:
-                return _not_seen(previous, scene, search), None
-            at_px, what = self.click_px, f"tracker.click_px = {list(self.click_px or ())}"
-            if self.box_px is not None:
-                at_px, what = box_of(self.box_px)[0], f"tracker.box_px = {list(self.box_px)}"
-            assert at_px is not None
-            return self._learn_look(previous, scene, at_px, assumed, f"{what} of image {frame.index}")
+                return scene.track(search, None), None
+            name, given = ("click_px", at_px) if self.box_px is None else ("box_px", self.box_px)
+            what = f"tracker.{name} = {list(given)} of image {frame.index}"
+            return self._learn_look(scene, search, at_px, assumed, what)
         noise = pixel_noise(frame.image)
         dark = self._dark_disc(scene, search, noise) if assumed != "bright" else None
         if assumed != "dark":
-            radius_px = self._radius_px(scene.calibration, scene.robot)
-            clear_px = (1.0 + self.wall_error_radii) * radius_px
-            distance_px, outstanding = scene.walls.distance_px, assumed == "auto"
-            spot = brightest_spot(frame.image, distance_px, radius_px, clear_px, outstanding=outstanding)
+            radius_px = self._radius_px(scene.calibration.um_per_px, scene.robot)
+            view = View(frame.image, scene.walls, radius_px, (1.0 + self.wall_error_radii) * radius_px)
+            spot = brightest_spot(view, outstanding=assumed == "auto")
             if spot is not None and (dark is None or spot[1] > dark.darkness):
-                return self._learn_look(previous, scene, spot[0], "bright", "the brightest spot")
+                return self._learn_look(scene, search, spot[0], "bright", "the brightest spot")
         if dark is None:
-            return _not_seen(previous, scene, search), None
-        nothing = np.zeros((0, 1, 1), np.float32)
-        appearance = Appearance(
-            frame.stamp_ns, "dark", noise, 0.0, search.nominal_px, np.array([dark.x, dark.y]), nothing
-        )
-        return _seen_track(scene, search, dark), appearance
+            return scene.track(search, None), None
+        nothing, centre_px = np.zeros((0, 1, 1), np.float32), np.array([dark.x, dark.y])
+        appearance = Appearance(frame.stamp_ns, "dark", noise, 0.0, search.nominal_px, centre_px, nothing)
+        return scene.track(search, dark), appearance
 
     def _learn_look(
-        self, previous: Track | None, scene: _Scene, at_px: tuple[float, float], polarity: str, what: str
+        self, scene: _Scene, search: DiscSearch, at_px: tuple[float, float], polarity: str, what: str
     ) -> tuple[Track, Appearance]:
         """The track and the appearance after learning the robot's look at a point."""
-        frame, walls = scene.frame, scene.walls
-        radius_px = self._radius_px(scene.calibration, scene.robot)
-        solid_px = self._solid_px(radius_px)
-        appearance = learn(frame.image, walls.distance_px, frame.stamp_ns, at_px, radius_px, polarity, solid_px, what)
-        search = self._everywhere(previous, scene)
+        view = self._view(scene, self._radius_px(scene.calibration.um_per_px, scene.robot))
+        appearance = learn(view, scene.frame.stamp_ns, at_px, polarity, what)
         if appearance.note:
-            return _not_seen(previous, scene, search), appearance
+            return scene.track(search, None), appearance
         x, y = appearance.centre_px.tolist()
-        scale = ReducedScale(appearance.radius_px)
-        box = _clip_box((x, y), 4.0 * radius_px, walls.box)
-        region = region_of(frame.image, walls.distance_px, _pad_box(box, scale.margin_px), scale, solid_px)
-        found = candidates(region, appearance, box, walls.distance_px, 0.0, appearance.centre_px)
+        box = _clip_box((x, y), 4.0 * view.radius_px, scene.walls.box)
+        found = candidates(view, appearance, box, 0.0, appearance.centre_px)[1]
         near = np.hypot(*(found.px - appearance.centre_px).T) < 0.7 * appearance.radius_px
-        track = _seen_track(scene, search, Disc(x, y, search.expected_px, 0.0, 1.0, 1.0))
         return replace(
-            track,
+            scene.track(search, Disc(x, y, search.expected_px, 0.0, 1.0, 1.0)),
             velocity_px_s=np.zeros(2),
             spread_px=0.3 * appearance.radius_px,
             energy=energy_of(appearance),
@@ -248,49 +254,41 @@ class Tracker:
     ) -> tuple[Track, Appearance | None]:
         """The robot by its learned look: near where it is expected, then as far as it can be, or in the whole image."""
         frame, walls, calibration = scene.frame, scene.walls, scene.calibration
-        scale, solid_px = ReducedScale(appearance.radius_px), self._solid_px(appearance.radius_px)
-        place_px = calibration.to_px(previous.position_um)
+        radius_px = appearance.radius_px
+        view = self._view(scene, radius_px)
         dt, frames = seconds(frame.stamp_ns - previous.stamp_ns), 1 + previous.lost_frames
-        motion = expected_motion(previous, place_px, scale.radius_px, dt)
+        motion = ExpectedMotion.after(previous, calibration.to_px(previous.position_um), radius_px, dt)
         expected = (float(motion.expected_px[0]), float(motion.expected_px[1]))
         everywhere = previous.lost_frames > self.reacquire_after
-        displacement = self.reach_speed * scene.robot.speed_limit_um_s * dt / calibration.um_per_px
-        farthest_px = max(self.search_radii * scale.radius_px + displacement, self.search_px) * frames
-        near_px = max(self.search_px, 4.0 * scale.radius_px, 6.0 * motion.spread_px)
+        farthest_px = self._range_px(scene, radius_px, dt) * frames
+        near_px = max(self.search_px, 4.0 * radius_px, 6.0 * motion.spread_px)
         which, joined, missed = None, None, np.zeros((0, 3))
         for range_px in (math.inf,) if everywhere else (near_px, max(farthest_px, 1.5 * near_px)):
             box = walls.box if everywhere else _clip_box(expected, range_px, walls.box)
-            region = region_of(frame.image, walls.distance_px, _pad_box(box, scale.margin_px), scale, solid_px)
             near = None if everywhere else motion.expected_px
-            found = candidates(region, appearance, box, walls.distance_px, _ENERGY_SHARE * previous.energy, near)
+            region, found = candidates(view, appearance, box, _ENERGY_SHARE * previous.energy, near)
             if everywhere:
                 which = alone(found, previous.energy, self.acquire_score)
             else:
-                which, missed = assign_objects(found, previous, motion, range_px)
-                if which is not None and not self._is_robot(found, which, previous, motion, near_px, scale.radius_px):
+                which, missed = assign_objects(found, motion, range_px)
+                if which is not None and not self._is_robot(found, which, motion, near_px):
                     which = None
-            joined = find_merged(found, which, previous, motion, missed, scale.radius_px)
+            joined = find_merged(found, which, motion, missed)
             if which is not None or joined is not None:
                 break
         roi = np.array(box, np.float64)
         seen = replace(previous, stamp_ns=frame.stamp_ns, seen=True, lost_frames=0, roi_px=roi)
         if joined is not None:
-            neighbours = np.concatenate([neighbours_of(found, joined.which), joined.neighbours.ravel()])
-            return replace(seen, position_um=calibration.to_um(joined.place_px), neighbours_px=neighbours), appearance
+            merged, place_px, hidden = joined
+            neighbours = np.concatenate([neighbours_of(found, merged), hidden.ravel()])
+            return replace(seen, position_um=calibration.to_um(place_px), neighbours_px=neighbours), appearance
         if which is None:
             return replace(unseen(previous, frame.stamp_ns), roi_px=roi), appearance
         blocks, score = locate_robot(region, found, which, appearance)
         to_px = region.to_px(blocks)
-        covered = hidden_neighbours(missed, to_px, scale.radius_px)
+        covered = hidden_neighbours(missed, to_px, radius_px)
         neighbours = np.concatenate([neighbours_of(found, which), covered.ravel()])
-        views = updated_views(
-            region,
-            blocks,
-            appearance,
-            score,
-            is_isolated(neighbours, to_px, scale.radius_px),
-            frame.stamp_ns - appearance.stamp_ns >= _UPDATE_NS,
-        )
+        isolated = is_isolated(neighbours, to_px, radius_px)
         track = replace(
             seen,
             position_um=calibration.to_um(to_px),
@@ -298,110 +296,75 @@ class Tracker:
             neighbours_px=neighbours,
         )
         if not len(covered):
-            track = with_motion(track, previous, motion, place_px, to_px, float(found.energy[which]), dt)
-        return track, appearance if views is None else replace(appearance, stamp_ns=frame.stamp_ns, views=views)
+            track = with_motion(track, motion, to_px, float(found.energy[which]))
+        return track, updated_look(region, blocks, appearance, score, isolated, frame.stamp_ns)
 
-    def _is_robot(
-        self,
-        found: Candidates,
-        which: int,
-        previous: Track,
-        motion: ExpectedMotion,
-        near_px: float,
-        radius_px: float,
-    ) -> bool:
+    def _is_robot(self, found: Candidates, which: int, motion: ExpectedMotion, near_px: float) -> bool:
         """True if the candidate that was assigned to the robot looks like it; beyond `near_px` it must be the only one.
 
         The neighbours of the frame before are known nearby only.
         """
+        previous = motion.previous
         known = found.similarity[which] >= (self.acquire_score if previous.lost_frames else self.least_score)
-        if not (known or similar(found, which, previous, motion, radius_px)):
+        if not (known or similar(found, which, motion)):
             return False
         far = math.dist(found.px[which], motion.expected_px) > near_px
         return not far or alone(found, previous.energy, self.acquire_score) == which
 
-    def _solid_px(self, radius_px: float) -> float:
-        """Distance to the mask's walls (negative: depth in the solid) from which on a pixel may show fluid."""
-        return -self.wall_error_radii * radius_px
+    def _view(self, scene: _Scene, radius_px: float) -> View:
+        """The image of a scene, whose walls may be off."""
+        return View(scene.frame.image, scene.walls, radius_px, -self.wall_error_radii * radius_px)
 
     def _dark_disc(self, scene: _Scene, search: DiscSearch, noise: float) -> Disc | None:
         """The dark disc; where there is none, one that is paler, or nearer to the walls than they permit if exact."""
         frame, walls = scene.frame, scene.walls
-        found = None
-        if frame.bits == 8:
-            found = best_disc(frame.image, walls, search)
+        found = best_disc(frame.image, walls, search) if frame.bits == 8 else None
         if found is None:
             score, likeness = max(search.least_score, _LENIENT_SCORE), max(search.least_likeness, _LENIENT_LIKENESS)
             search = replace(search, least_score=score, least_likeness=likeness)
             found = best_disc_normalised(frame.image, walls, search, noise, self.wall_error_radii * search.nominal_px)
         return found
 
-    def _everywhere(self, previous: Track | None, scene: _Scene) -> DiscSearch:
-        """A search in the whole channel."""
-        return self._plan(
-            None if previous is None else replace(previous, score=0.0),
-            scene.frame,
-            scene.walls,
-            scene.calibration,
-            scene.robot,
+    def _range_px(self, scene: _Scene, radius_px: float, dt: float) -> float:
+        """Search range around the last position of an image before."""
+        displacement = self.reach_speed * scene.robot.speed_limit_um_s * dt / scene.calibration.um_per_px
+        return max(self.search_radii * radius_px + displacement, self.search_px)
+
+    def _plan(self, scene: _Scene, *, everywhere: bool = False) -> DiscSearch:
+        """Area of the search, from the previous message; or the whole channel."""
+        previous, box = scene.previous, scene.walls.box
+        nominal = scene.robot.radius_um / scene.calibration.um_per_px
+        centre, range_px, score, likeness = (0.0, 0.0), math.inf, self.acquire_score, self.acquire_likeness
+        # A score of 0 means that the robot was never seen.
+        lost = previous is None or previous.score <= 0 or previous.lost_frames > self.reacquire_after
+        if previous is not None and not (lost or everywhere):
+            x, y = scene.calibration.to_px(previous.position_um).tolist()
+            centre = (x, y)
+            frames = 1 + previous.lost_frames
+            dt = seconds(scene.frame.stamp_ns - previous.stamp_ns) / frames
+            range_px = self._range_px(scene, previous.radius_px, dt) * frames
+            x0, y0, x1, y1 = box
+            left, top = max(math.floor(x - range_px), x0), max(math.floor(y - range_px), y0)
+            box = (left, top, min(math.ceil(x + range_px) + 1, x1), min(math.ceil(y + range_px) + 1, y1))
+            # While the robot is lost, an object of low likeness is more probably a piece of debris.
+            if not previous.lost_frames:
+                score, likeness = self.least_score, 0.0
+        return DiscSearch(
+            box=box,
+            centre=centre,
+            range_px=range_px,
+            nominal_px=nominal,
+            expected_px=nominal if previous is None else previous.radius_px,
+            margin_px=min(max(self.wall_margin_um / scene.calibration.um_per_px, 1.0), 0.5 * nominal),
+            least_score=score,
+            least_likeness=likeness,
+            least_contrast=self.least_contrast,
+            size_tolerance=self.size_tolerance,
+            candidates=self.candidates,
         )
 
-    @property
-    def _limits(self) -> DiscLimits:
-        return DiscLimits(self.least_contrast, self.size_tolerance, self.candidates)
 
-    def _plan(
-        self, previous: Track | None, frame: Frame, walls: Walls, calibration: Calibration, robot: Robot
-    ) -> DiscSearch:
-        """Area of the search, from the previous message."""
-        nominal = robot.radius_um / calibration.um_per_px
-        margin = min(max(self.wall_margin_um / calibration.um_per_px, 1.0), 0.5 * nominal)
-        # A score of 0 means that the robot was never seen.
-        if previous is None or previous.score <= 0 or previous.lost_frames > self.reacquire_after:
-            expected = nominal if previous is None else previous.radius_px
-            least = (self.acquire_score, self.acquire_likeness)
-            return DiscSearch(walls.box, (0.0, 0.0), math.inf, nominal, expected, margin, *least, self._limits)
-        x, y = calibration.to_px(previous.position_um).tolist()
-        frames = 1 + previous.lost_frames
-        dt = seconds(frame.stamp_ns - previous.stamp_ns) / frames
-        displacement = self.reach_speed * robot.speed_limit_um_s * dt / calibration.um_per_px
-        range_px = max(self.search_radii * previous.radius_px + displacement, self.search_px) * frames
-        x0, y0, x1, y1 = walls.box
-        left, top = max(math.floor(x - range_px), x0), max(math.floor(y - range_px), y0)
-        box = (left, top, min(math.ceil(x + range_px) + 1, x1), min(math.ceil(y + range_px) + 1, y1))
-        # While the robot is lost, an object of low likeness is more probably a piece of debris.
-        least = (self.acquire_score, self.acquire_likeness) if previous.lost_frames else (self.least_score, 0.0)
-        return DiscSearch(box, (x, y), range_px, nominal, previous.radius_px, margin, *least, self._limits)
-
-
-def _seen_track(scene: _Scene, search: DiscSearch, found: Disc) -> Track:
-    radius_px = search.expected_px + _RADIUS_WEIGHT * (found.radius_px - search.expected_px)
-    return Track(
-        stamp_ns=scene.frame.stamp_ns,
-        seen=True,
-        position_um=scene.calibration.to_um((found.x, found.y)),
-        score=found.score,
-        lost_frames=0,
-        radius_px=min(max(radius_px, _SMALLEST * search.nominal_px), LARGEST * search.nominal_px),
-        roi_px=np.array(search.box, np.float64),
-    )
-
-
-def _not_seen(previous: Track | None, scene: _Scene, search: DiscSearch) -> Track:
-    height, width = scene.frame.image.shape
-    middle = scene.calibration.to_um(((width - 1) / 2, (height - 1) / 2))
-    return Track(
-        stamp_ns=scene.frame.stamp_ns,
-        seen=False,
-        position_um=middle if previous is None else previous.position_um,
-        score=0.0 if previous is None else previous.score,
-        lost_frames=1 if previous is None else previous.lost_frames + 1,
-        radius_px=search.expected_px,
-        roi_px=np.array(search.box, np.float64),
-    )
-
-
-def move_neighbours(previous: Track, by_px: NDArray[np.float64]) -> Track:
+def move_neighbours(previous: Track, by_px: Floats) -> Track:
     """A track as the next image shows it, which lies `by_px` (2,) farther: the neighbours are places in the image."""
     if not previous.neighbours_px.size or not by_px.any():
         return previous
@@ -420,7 +383,3 @@ def _clip_box(centre: tuple[float, float], range_px: float, box: Box) -> Box:
     (x, y), reach = centre, min(range_px, 1e5)
     left, top = max(math.floor(x - reach), x0), max(math.floor(y - reach), y0)
     return left, top, max(min(math.ceil(x + reach) + 1, x1), left), max(min(math.ceil(y + reach) + 1, y1), top)
-
-
-def _pad_box(box: Box, margin_px: int) -> Box:
-    return box[0] - margin_px, box[1] - margin_px, box[2] + margin_px, box[3] + margin_px

@@ -36,7 +36,7 @@ class Walls:
 
 
 @lru_cache(maxsize=4)
-def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, int]) -> Walls:
+def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, ...]) -> Walls:
     """Walls of a chip (compared by identity) in an image of `shape` (rows, columns)."""
     height, width = shape
     scale = calibration.um_per_px / chip.um_per_px  # mask pixels per camera pixel

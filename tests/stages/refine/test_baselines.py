@@ -12,9 +12,9 @@ from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.refine import Ni, Pinn, Refiner, Unet
 from flowrec.stages.refine.case import Crop
-from flowrec.stages.refine.collocation import Collocation
 from flowrec.stages.refine.network import CoordinateNet, trained_network
 from flowrec.stages.refine.observation_operator import observation_operator
+from flowrec.stages.refine.pinn import Collocation
 from flowrec.stages.refine.weights import write_weights
 
 QUICK = {

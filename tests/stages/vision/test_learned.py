@@ -304,11 +304,11 @@ def test_a_radius_that_is_too_small_for_the_optics_costs_little() -> None:
 def test_an_object_that_a_known_neighbour_explains_is_not_taken_for_a_robot_that_has_gone() -> None:
     one = np.ones(1)
     found = Candidates(np.array([[10.0, 0.2]]), np.array([[10.0, 0.2]]), 50.0 * one, np.zeros(1, int), one, np.zeros(2))
-    motion = ExpectedMotion(np.array([6.0, 0.0]), 1.0)
     last = Track(0, True, np.zeros(2), 1.0, 0, 2.5, np.zeros(4), None, np.zeros(2), 1.0, 50.0)
-    assert assign_objects(found, last, motion, 10.0)[0] == 0
+    motion = ExpectedMotion(last, np.zeros(2), 2.5, 0.1, np.array([6.0, 0.0]), 1.0)
+    assert assign_objects(found, motion, 10.0)[0] == 0
     known = replace(last, neighbours_px=np.array([10.0, 0.0, 50.0]))
-    assert assign_objects(found, known, motion, 10.0)[0] is None
+    assert assign_objects(found, replace(motion, previous=known), 10.0)[0] is None
 
 
 @pytest.mark.parametrize(("away_px", "twins", "is_robot"), [(5.0, 2, True), (50.0, 2, False), (50.0, 1, True)])
@@ -318,5 +318,5 @@ def test_far_from_where_it_is_expected_the_robot_must_be_the_only_one_of_its_loo
     px = np.array([[100.0 + away_px, 100.0], [200.0, 100.0]])[:twins]
     found = Candidates(px, px, np.full(twins, 30.0), np.zeros(twins, np.intp), np.full(twins, 0.9), px)
     before = Track(0, True, np.zeros(2), 0.9, 0, 6.0, np.zeros(4), energy=30.0)
-    expected = ExpectedMotion(np.array([100.0, 100.0]), 3.0)
-    assert Tracker()._is_robot(found, 0, before, expected, 20.0, 6.0) is is_robot
+    expected = ExpectedMotion(before, np.zeros(2), 6.0, 0.1, np.array([100.0, 100.0]), 3.0)
+    assert Tracker()._is_robot(found, 0, expected, 20.0) is is_robot
