@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import Phase, Tick, printable, seconds, shift_px
 from flowrec.store import ChipCamera
-from flowrec.view import Batch, Scene, state_text
+from flowrec.view import Batch, Scene, encode_jpeg, state_text
 
 # What the page shows depends on these fields of a tick.
 SHOWN = ("frame", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing", "losses")
@@ -104,10 +104,7 @@ class PageState:
         frame = self.tick.frame
         if frame is None or not frame.image.size:
             return None
-        image = frame.image if frame.bits == 8 else (frame.image >> (frame.bits - 8)).astype(np.uint8)
-        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-        assert done
-        return bytes([min(self._step, 255)]) + data.tobytes()
+        return bytes([min(self._step, 255)]) + encode_jpeg(frame.image, frame.bits, _QUALITY)
 
     def _losses(self) -> list[str]:
         timing, losses = self.tick.timing, self.tick.losses

@@ -1,10 +1,11 @@
 from . import viewer as viewer
 from .bare_blueprint import bare_blueprint as bare_blueprint
 from .bare_plots import Plot as Plot, plot_of as plot_of
+from .camera_pictures import WindowCompleter as WindowCompleter, encode_jpeg as encode_jpeg
 from .catalog_server import DATASET as DATASET, serve_recordings as serve_recordings
 from .colours import ColourScale as ColourScale
 from .entities import PAIR as PAIR, REPLAY as REPLAY
-from .feed import Batch as Batch, Feed as Feed
+from .feed import Batch as Batch, Feed as Feed, FeedSink as FeedSink, received as received
 from .flow_values import (
     arrow_grid as arrow_grid, change as change, flow_arrows as flow_arrows, peak as peak, scale_of as scale_of,
     speed as speed, uncertainty as uncertainty,
@@ -23,4 +24,3 @@ from .summary_text import (
 from .viewer import (
     LOOPBACK as LOOPBACK, executable as executable, has_display as has_display, open_viewer as open_viewer,
 )
-from .window_images import WindowCompleter as WindowCompleter

@@ -2,24 +2,46 @@
 
 from __future__ import annotations
 
+import functools
+import math
+from collections import deque
 from collections.abc import Iterable
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowrec.core import NS_PER_S
 from flowrec.view.colours import SOLID, Rgb
 
 Picture = NDArray[np.uint8]
 Points = NDArray[np.float64]
 SUBPIXEL_BITS = 4  # coordinates of OpenCV's lines are given in 1/16 px
 _RIM = 0.75  # opacity of the rim
+_TRAIL_S = 4.0
 _FAR_PX = 1e5  # beyond it nothing is drawn
 _HEAD = 0.45  # length of an arrow's head over that of the arrow
 _HEAD_PX = (2.5, 6.0)  # least and largest, in widths of its line
 _ANGLE = np.linspace(0.0, 2.0 * np.pi, 33)
 CIRCLE: Points = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
 CROSS: tuple[Points, Points] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
+
+
+class Trail:
+    """The way of the last seconds, by points that are at least `step_px` apart."""
+
+    def __init__(self, step_px: float) -> None:
+        self._step_px = step_px
+        self._points: deque[tuple[int, Points]] = deque()
+
+    def add(self, stamp_ns: int, point: Points) -> list[Points]:
+        """The points of the trail after another one (2,)."""
+        kept = self._points
+        if not kept or math.dist(kept[-1][1], point) >= self._step_px:
+            kept.append((stamp_ns, point))
+        while kept and stamp_ns - kept[0][0] > _TRAIL_S * NS_PER_S:
+            kept.popleft()
+        return [each for _, each in kept]
 
 
 class Layer:
@@ -33,50 +55,32 @@ class Layer:
     def __init__(self, shape: tuple[int, int]) -> None:
         self._kept = np.ones(shape, np.float32)
         self._added = np.zeros((*shape, 3), np.float32)
-        self._where = np.zeros(0, np.intp)
-        self._factor, self._offset = np.zeros((0, 1), np.float32), np.zeros((0, 3), np.float32)
 
-    def lines(self, lines: Iterable[Points], colour: Rgb, width_px: float) -> None:
-        """Polylines, each (n, 2) as x, y."""
-        polylines = [to_fixed_point(each) for each in lines if drawable(each)]
-        for shade, width, opacity in ((SOLID, width_px + 2.0, _RIM), (colour, width_px, 1.0)):
-            mask = np.zeros(self._kept.shape, np.uint8)
-            cv2.polylines(mask, polylines, False, 255, max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
-            self._mix(mask, shade, opacity)
-
-    def arrows(self, begins: Points, ends: Points, colour: Rgb, width_px: float) -> None:
-        """Arrows from `begins` to `ends`, both (n, 2)."""
-        polylines, heads = [], []
-        for begin, end in zip(begins, ends, strict=True):
-            length = float(np.hypot(*(end - begin)))
-            if not drawable(np.array([begin, end])) or length <= 0.0:
-                continue
-            along = (end - begin) / length
-            head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
-            across = 0.45 * head * np.array([-along[1], along[0]])
-            base = end - head * along
-            polylines.append(to_fixed_point(np.array([begin, base])))
-            heads.append(to_fixed_point(np.array([end, base + across, base - across])))
+    def lines(self, lines: Iterable[Points], heads: Iterable[Points], colour: Rgb, width_px: float) -> None:
+        """Polylines, each (n, 2) as x, y, and polygons that are filled."""
+        polylines = [_fixed(each) for each in lines if drawable(each)]
+        polygons = [_fixed(each) for each in heads]
         for shade, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
             mask = np.zeros(self._kept.shape, np.uint8)
-            cv2.polylines(mask, polylines, False, 255, max(round(width_px + rim), 1), cv2.LINE_AA, SUBPIXEL_BITS)
-            for each in heads:
+            width = max(round(width_px + rim), 1)
+            cv2.polylines(mask, polylines, False, 255, width, cv2.LINE_AA, SUBPIXEL_BITS)
+            for each in polygons:
                 cv2.fillPoly(mask, [each], 255, cv2.LINE_AA, SUBPIXEL_BITS)
             if rim:
-                cv2.polylines(mask, heads, True, 255, round(rim), cv2.LINE_AA, SUBPIXEL_BITS)
+                cv2.polylines(mask, polygons, True, 255, round(rim), cv2.LINE_AA, SUBPIXEL_BITS)
             self._mix(mask, shade, opacity)
 
-    def finish(self) -> None:
-        """End the drawing; only then the layer can be mixed with images."""
-        self._where = np.flatnonzero(self._kept < 1.0)
-        self._factor = self._kept.reshape(-1, 1)[self._where]
-        self._offset = self._added.reshape(-1, 3)[self._where] + 0.5
-
     def blend(self, grey: NDArray[np.uint8], picture: Picture) -> None:
-        """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it."""
-        levels = grey.reshape(-1)[self._where]
-        mixed = (levels[:, None] * self._factor + self._offset).astype(np.uint8)
-        picture.reshape(-1, 3)[self._where] = mixed
+        """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it; nothing is drawn after it."""
+        where, factor, offset = self._finished
+        levels = grey.reshape(-1)[where]
+        picture.reshape(-1, 3)[where] = (levels[:, None] * factor + offset).astype(np.uint8)
+
+    @functools.cached_property
+    def _finished(self) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+        """Places of the pixels that have lines, and their a and b, which rounds."""
+        where = np.flatnonzero(self._kept < 1.0)
+        return where, self._kept.reshape(-1, 1)[where], self._added.reshape(-1, 3)[where] + 0.5
 
     def _mix(self, mask: NDArray[np.uint8], colour: Rgb, opacity: float) -> None:
         inked = np.flatnonzero(mask)  # a few percent of the pixels
@@ -86,10 +90,27 @@ class Layer:
         added[inked] = added[inked] * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32)
 
 
-def draw_outlines(picture: Picture, polylines: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
-    """Polylines, as `fixed` returns them, that are drawn for one image only."""
+def arrows(begins: Points, ends: Points, width_px: float) -> tuple[list[Points], list[Points]]:
+    """Shafts and heads, for `Layer.lines`, of arrows from `begins` to `ends`, both (n, 2)."""
+    shafts, heads = [], []
+    for begin, end in zip(begins, ends, strict=True):
+        length = float(np.hypot(*(end - begin)))
+        if not drawable(np.array([begin, end])) or length <= 0.0:
+            continue
+        along = (end - begin) / length
+        head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
+        across = 0.45 * head * np.array([-along[1], along[0]])
+        base = end - head * along
+        shafts.append(np.array([begin, base]))
+        heads.append(np.array([end, base + across, base - across]))
+    return shafts, heads
+
+
+def draw_outline(picture: Picture, line: Points, colour: Rgb, width_px: float) -> None:
+    """A polyline (n, 2) that is drawn for one image only."""
     for shade, width in ((SOLID, width_px + 1.0), (colour, width_px)):
-        cv2.polylines(picture, polylines, False, bgr(shade), max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+        width = max(round(width), 1)
+        cv2.polylines(picture, [_fixed(line)], False, bgr(shade), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
@@ -114,7 +135,7 @@ def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) 
     picture[y0:y1, x0:x1][inside] = clean[y0:y1, x0:x1][inside]
 
 
-def to_fixed_point(points: Points) -> NDArray[np.int32]:
+def _fixed(points: Points) -> NDArray[np.int32]:
     """Points (n, 2) in 1/16 px, as OpenCV takes them."""
     return np.rint(points * (1 << SUBPIXEL_BITS)).astype(np.int32).reshape(-1, 1, 2)
 

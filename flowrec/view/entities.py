@@ -32,12 +32,17 @@ REFINED = "flow/refined/speed"
 TRUE = "flow/truth/speed"
 CHANGE = "flow/change/map"
 UNCERTAINTY = "flow/uncertainty/map"
-NOT_YET = "not yet"  # beside a map that comes later in the session
-SPEED_SCALE = "flow/speed scale"  # colour bar and ticks, common to all maps of speed
-CHANGE_SCALE = "flow/change/scale"
-UNCERTAINTY_SCALE = "flow/uncertainty/scale"
 TIME_TO_GO = "plan/time to go/map"
-TIME_TO_GO_SCALE = "plan/time to go/scale"
+SPEED_SCALE = "flow/speed scale"
+SCALES = {  # of each map: the colour bar and its ticks; one is common to all maps of speed
+    ASSUMED: SPEED_SCALE,
+    REFINED: SPEED_SCALE,
+    TRUE: SPEED_SCALE,
+    CHANGE: "flow/change/scale",
+    UNCERTAINTY: "flow/uncertainty/scale",
+    TIME_TO_GO: "plan/time to go/scale",
+}
+NOT_YET = "not yet"  # beside a map that comes later in the session
 
 AMPLITUDE = "coils/amplitude"
 FREQUENCY = "coils/frequency"
@@ -59,6 +64,8 @@ SIGHT = "Robot"
 LANES = (PHASE, ALARM, MARKS, LOSSES, SIGHT)
 LANES_OF_RUN = (MARKS, LOSSES, SIGHT)  # the same in a replay
 EXTRA = "extra"  # before the path of an extra topic and the field of its message
+# A session may lack these: a layout shows those that were logged.
+OPTIONAL = frozenset({*SCALES, *LANES, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING})
 SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"
@@ -101,12 +108,18 @@ def entity_path(prefix: str, entity: str) -> str:
 
 
 class EntityLogger:
-    """Logs the entities of one session below `prefix`: '', or one of REPLAY or PAIR."""
+    """Logs the entities of one session below `prefix`: '', or one of REPLAY or PAIR.
+
+    Attributes
+    ----------
+    present : the OPTIONAL entities, and those of extra topics, that were ever logged.
+    """
 
     def __init__(self, stream: rr.RecordingStream, prefix: str) -> None:
         self.stream = stream
         self.prefix = prefix
         self.style = _STYLES[prefix]
+        self.present: set[str] = set()
         self._paths: dict[str, str] = {}
 
     def log(self, entity: str, *components: rr.AsComponents, static: bool = False) -> None:
@@ -115,6 +128,12 @@ class EntityLogger:
         if path is None:
             path = self._paths[entity] = entity_path(self.prefix, entity)
         self.stream.log(path, components[0], *components[1:], static=static)
+        if not static and (entity in OPTIONAL or entity.startswith(EXTRA)) and not isinstance(components[0], rr.Clear):
+            self.present.add(entity)
+
+    def clear(self, entity: str) -> None:
+        """Show nothing of an entity from the present time on."""
+        self.log(entity, rr.Clear(recursive=False))
 
     def log_styles(self) -> None:
         """Log what never changes of moving entities, so that each tick logs only their positions."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 
 from flowrec.core import Estimate, Mission, printable, seconds
 from flowrec.view import colours
-from flowrec.view.colours import round_below
-from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, bgr, draw_mask
+from flowrec.view.colours import Rgb, round_below
+from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, Points, arrows, bgr, draw_mask
 from flowrec.view.text_masks import clock_mask, text_mask
 
 ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
@@ -46,23 +46,18 @@ class StatusBar:
         """
         r, middle = 0.34 * self._letter, 0.5 * self._height
         centre = np.array([1.2 * r, middle])
-        self._parts = [
-            self._part(2.4 * r, "robot", lambda layer: layer.lines([centre + r * CIRCLE], ROBOT, self._line))
-        ]
+        self._parts = [self._part(2.4 * r, "robot", ROBOT, [centre + r * CIRCLE])]
         if goal:
             sign = [centre + 1.2 * r * part for part in GOAL_SIGN]
-            self._parts.append(self._part(2.4 * r, "goal", lambda layer: layer.lines(sign, GOAL, 0.8 * self._line)))
+            self._parts.append(self._part(2.4 * r, "goal", GOAL, sign, width=0.8))
         if route:
             px = 1.4 * self._letter
-            line = [np.array([(0.0, middle), (px, middle)])]
-            self._parts.append(self._part(px, "route", lambda layer: layer.lines(line, ROUTE, self._line)))
+            self._parts.append(self._part(px, "route", ROUTE, [np.array([(0.0, middle), (px, middle)])]))
         if flow is not None:
             words, speed, px_per_speed = flow
             tail, tip = np.array([[1.0, middle]]), np.array([[1.0 + speed * px_per_speed, middle]])
-            text = f"{words} {speed:g} µm/s"
-            self._parts.append(
-                self._part(tip[0, 0], text, lambda layer: layer.arrows(tail, tip, FLOW, 0.8 * self._line))
-            )
+            arrow = arrows(tail, tip, 0.8 * self._line)
+            self._parts.append(self._part(tip[0, 0], f"{words} {speed:g} µm/s", FLOW, *arrow, width=0.8))
         self._parts.append(self._scale_bar())
 
     def draw(self, bar: Picture, stamp_ns: int, mission: Mission | None, estimate: Estimate | None) -> None:
@@ -85,18 +80,25 @@ class StatusBar:
         px, middle, tick = length_um / self._um_per_px, 0.5 * self._height, 0.3 * self._letter
         bar = np.array([(1.0, middle), (1.0 + px, middle)])
         ends = [np.array([(x, middle - tick), (x, middle + tick)]) for x in bar[:, 0]]
-        return self._part(px + 2.0, length_text(length_um), lambda layer: layer.lines([bar, *ends], _TEXT, self._line))
+        return self._part(px + 2.0, length_text(length_um), _TEXT, [bar, *ends])
 
-    def _part(self, sign_px: float, words: str, draw: Callable[[Layer], None]) -> Picture:
-        """A sign of some width with its words to the right of it."""
+    def _part(
+        self,
+        sign_px: float,
+        words: str,
+        colour: Rgb,
+        lines: Sequence[Points],
+        heads: Sequence[Points] = (),
+        width: float = 1.0,
+    ) -> Picture:
+        """A sign of some px in the given colour, by `Layer.lines`, with its words to the right of it."""
         gap, mask = round(0.45 * self._letter), text_mask(words, self._letter)
         sign = math.ceil(sign_px)
         picture = np.empty((self._height, sign + gap + mask.shape[1] + round(1.2 * self._letter), 3), np.uint8)
         picture[:] = bgr(_GROUND)
         draw_mask(picture, mask, sign + gap, self._top, _TEXT)
         layer = Layer(picture.shape[:2])
-        draw(layer)
-        layer.finish()
+        layer.lines(lines, heads, colour, width * self._line)
         layer.blend(picture[..., 0].copy(), picture)
         return picture
 
