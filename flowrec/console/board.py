@@ -134,7 +134,7 @@ class Board:
             self.left.set()
 
     async def news(self, shown: Contents) -> tuple[Contents, str, bytes | None]:
-        """Wait until there is more than a page has shown: all there is, and what is new of it, as JSON and a picture."""
+        """Wait until there is more than a page has shown: all there is; what is new of it, as JSON; a new picture."""
         while shown is self._now:
             await self._changed.wait()
         now = self._now

@@ -108,13 +108,13 @@ def arrows(begins: Points, ends: Points, width_px: float) -> tuple[list[Points],
 
 def draw_outline(picture: Picture, line: Points, colour: Rgb, width_px: float) -> None:
     """A polyline (n, 2) that is drawn for one image only."""
-    for shade, width in ((SOLID, width_px + 1.0), (colour, width_px)):
-        width = max(round(width), 1)
+    for shade, rim in ((SOLID, 1.0), (colour, 0.0)):
+        width = max(round(width_px + rim), 1)
         cv2.polylines(picture, [_fixed(line)], False, bgr(shade), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
-    """Put letters (see text_masks.py) on a picture of one colour; returns their width in px."""
+    """Put letters, a mask of grey levels (h, w), on a picture of one colour; returns their width in px."""
     rows, columns = max(picture.shape[0] - top, 0), max(picture.shape[1] - left, 0)
     mask = mask[:rows, :columns]
     part = picture[top : top + mask.shape[0], left : left + mask.shape[1]]

@@ -202,8 +202,7 @@ class Feed:
         step = 1
         while self._queue:
             tick = self._queue.popleft()
-            new = {name: getattr(tick, name) for name in self._shown if getattr(tick, name) is not getattr(sent, name)}
-            changes.append({"stamp_ns": tick.stamp_ns, **new})
+            changes.append({"stamp_ns": tick.stamp_ns, **tick.news(sent, self._shown)})
             sent = tick
         frame = self._frame
         if changes and frame is not None and sent.frame is not None and frame.index == sent.frame.index:

@@ -14,27 +14,28 @@ Mode = Literal["spawn", "serve"]
 _START_S = 30.0  # for the server to accept viewers: importing Rerun takes a second, on a busy machine more
 _CLOSE_S = 10.0  # for the last ticks to be shown; then the process hangs
 _POLL_S = 0.02
+_MAX_HZ = 20.0
 _WITHOUT = "the run goes on without"
 
 
 class LiveView(FeedSink):
     """A sink that shows the run in Rerun: `spawn` opens a window, `serve` waits for viewers on this machine."""
 
-    def __init__(self, scene: Scene, mode: Mode = "spawn", port: int | None = None, max_hz: float = 20.0) -> None:
+    def __init__(self, scene: Scene, mode: Mode = "spawn", port: int | None = None) -> None:
         super().__init__()
         self.port = viewer.free_port() if port is None else port
         self.afterwards = ""  # one line for the operator about a server that stays after `close`; '' if it does not
-        self._message = self._start(scene, mode, max_hz)
+        self._message = self._start(scene, mode)
         self._wait_until_it_accepts()
 
-    def _start(self, scene: Scene, mode: Mode, max_hz: float) -> str:
+    def _start(self, scene: Scene, mode: Mode) -> str:
         """Start the process; the message for the operator."""
         if viewer.executable() is None:
             return f"no live view: Rerun's viewer is not installed (pip install rerun-sdk); {_WITHOUT}"
         window = mode == "spawn" and viewer.has_display()
         command = (live_server.__name__, str(self.port), "window" if window else "serve")
         try:
-            self._feed = Feed(command, scene, max_hz)
+            self._feed = Feed(command, scene, _MAX_HZ)
         except OSError as error:
             return f"no live view: its process does not start ({error.strerror or error}); {_WITHOUT}"
         how = f"rerun --connect {self.url}"

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from flowrec.core import (
+    CameraLosses,
     Currents,
     Demand,
+    Drops,
     Estimate,
     Event,
     Frame,
@@ -24,6 +24,7 @@ from flowrec.core import (
     Route,
     Tick,
     Timing,
+    Track,
     message_fields,
     seconds,
 )
@@ -42,6 +43,10 @@ _NOMINAL_PX = 640.0  # width of the image that the sizes below are meant for
 _TRAIL_STEP_PX = 1.0
 _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.WARNING: "WARN", Level.ERROR: "ERROR"}
+_SHOWN = (  # fields of a tick, in the order in which they are logged
+    *("route", "mission", "track", "estimate", "demand", "currents"),
+    *("health", "timing", "event", "operator", "drops", "losses"),
+)
 _WORD_SHARE = 0.16, 0.12  # of the view: half the width, and the height, of the longest word about the robot
 
 
@@ -90,20 +95,6 @@ class TickLogger:
         self._log(e.OUTLINE, outlines, static=True)
         self._entities.log_styles()
         self._entities.log_series()
-        self._by_field: dict[str, Callable[[Any], None]] = {
-            "route": self._log_route,
-            "mission": self._log_mission,
-            "track": self.states.log_sight,
-            "estimate": self._log_estimate,
-            "demand": self._log_demand,
-            "currents": self._log_currents,
-            "health": self._log_health,
-            "timing": self._log_timing,
-            "event": self._log_event,
-            "operator": self._log_operator,
-            "drops": self.states.log_drops,
-            "losses": self.states.log_losses,
-        }
 
     def log(self, tick: Tick, frame_index: int | None = None) -> None:
         """Log what is new since the previous tick; `frame_index` is for a tick without its frame."""
@@ -122,13 +113,51 @@ class TickLogger:
             self._log_image(tick.frame)
         self._flow.log_not_yet(tick.refined, self._last)
         self._flow.log_fields(tick, self._last)
-        for field, log_message in self._by_field.items():
-            message = getattr(tick, field)
-            if message is not None and message is not getattr(self._last, field):
-                log_message(message)
+        for message in tick.news(self._last, _SHOWN).values():
+            self._log_message(message)
         for path, message in tick.extra.items():
             if message is not self._last.extra.get(path):
                 self._log_extra(path, message)
+
+    def _log_message(self, message: Message) -> None:
+        """Log a new message of the last tick."""
+        match message:
+            case Route():
+                self._log_route(message)
+            case Mission():
+                last = self._last.mission
+                if last is None or not np.array_equal(message.goal_um, last.goal_um, equal_nan=True):
+                    self._log_goal(message.goal_um)
+                self.states.log_mission(message)
+            case Track():
+                self.states.log_sight(message)
+            case Estimate():
+                self._log_estimate(message)
+            case Demand():
+                self._log_demand(message)
+            case Currents():
+                # The currents themselves oscillate at this frequency, too fast to be drawn from a sample a frame.
+                self._log(e.AMPLITUDE, rr.Scalars(message.amplitude_mt))
+                self._log(e.FREQUENCY, rr.Scalars(message.frequency_hz))
+                self._log(e.HEADING, rr.Scalars(math.degrees(message.heading_rad)))
+            case Health():
+                self.states.log_alarm(message.alarm)
+                if math.isfinite(message.nis):
+                    self._log(e.NIS_MEAN, rr.Scalars(message.nis))
+                self._log(e.PULSATION, rr.Scalars(100.0 * message.pulsation_share))
+            case Timing():
+                computing = [message.track_ms, message.observe_ms, message.control_ms]
+                self._log(e.TIMING, rr.Scalars([*computing, message.sinks_ms, message.total_ms]))
+            case Event():
+                self._log_text(e.EVENTS, message.text, _LEVELS.get(message.level, "INFO"))
+            case OperatorEvent():
+                self.states.log_mark(message)
+                said = f": {message.text}" if message.text else ""
+                self._log_text(e.OPERATOR, f"operator: {message.action}{said}", "INFO")
+            case Drops():
+                self.states.log_drops(message)
+            case CameraLosses():
+                self.states.log_losses(message)
 
     def _log_extra(self, path: str, message: Message) -> None:
         """The floats of a message as lines over time, a vector as a line an element."""
@@ -157,12 +186,6 @@ class TickLogger:
         path, style = self._scene.to_plane(route.waypoints_um), self._style
         order = 20.0 + style.second
         self._log(e.PATH, rr.LineStrips2D([path], colors=style.path, radii=points(style.width), draw_order=order))
-
-    def _log_mission(self, mission: Mission) -> None:
-        last = self._last.mission
-        if last is None or not np.array_equal(mission.goal_um, last.goal_um, equal_nan=True):
-            self._log_goal(mission.goal_um)
-        self.states.log_mission(mission)
 
     def _log_goal(self, goal_um: NDArray[np.float64]) -> None:
         if not np.isfinite(goal_um).all():
@@ -233,29 +256,6 @@ class TickLogger:
             vector = self._scene.directions(demand.velocity_um_s * length)
             position = self._scene.to_plane(self._on_chip(self._tick.estimate.position_um))
             self._log(e.COMMAND, rr.Arrows2D.from_fields(origins=[position], vectors=[vector]))
-
-    def _log_currents(self, currents: Currents) -> None:
-        # The currents themselves oscillate at this frequency, too fast to be drawn from a sample a frame.
-        self._log(e.AMPLITUDE, rr.Scalars(currents.amplitude_mt))
-        self._log(e.FREQUENCY, rr.Scalars(currents.frequency_hz))
-        self._log(e.HEADING, rr.Scalars(math.degrees(currents.heading_rad)))
-
-    def _log_health(self, health: Health) -> None:
-        self.states.log_alarm(health.alarm)
-        if math.isfinite(health.nis):
-            self._log(e.NIS_MEAN, rr.Scalars(health.nis))
-        self._log(e.PULSATION, rr.Scalars(100.0 * health.pulsation_share))
-
-    def _log_timing(self, timing: Timing) -> None:
-        parts = [timing.track_ms, timing.observe_ms, timing.control_ms, timing.sinks_ms, timing.total_ms]
-        self._log(e.TIMING, rr.Scalars(parts))
-
-    def _log_event(self, event: Event) -> None:
-        self._log_text(e.EVENTS, event.text, _LEVELS.get(event.level, "INFO"))
-
-    def _log_operator(self, event: OperatorEvent) -> None:
-        self.states.log_mark(event)
-        self._log_text(e.OPERATOR, f"operator: {event.action}" + (f": {event.text}" if event.text else ""), "INFO")
 
     def _log_text(self, entity: str, text: str, level: str) -> None:
         # The time is in the text: a column of the view shows it to the nanosecond.

@@ -90,9 +90,7 @@ class ColourBar:
         marks = rr.LineStrips2D(
             [[[right, at], [right + dash, at]] for at in y], colors=colours.WHITE, radii=points(0.8)
         )
-        sign = "+" if scale.table == "change" else ""
-        labels = [f"{value:{sign}g}" if abs(value) > 1e-9 * scale.high else "0" for value in scale.ticks]
-        labels.append(scale.unit)
+        labels = [*scale.labels, "s" if scale.table == "time" else "µm/s"]
         # Rerun centres a label below its point: a little up and half a label to the right puts it beside its tick.
         positions = [(right + 3.2 * self.width, row - 0.045 * self.height) for row in y]
         positions.append((self.left + 0.5 * self.width, self.top - 0.2 * self.height))
