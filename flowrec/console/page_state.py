@@ -34,7 +34,9 @@ class PageState:
         self.tick = Tick()
         self.remarks: dict[str, Any] = {}
         self._scene = scene
-        self._camera = ChipCamera(scene.calibration, _size_px(scene), scene.robot.radius_um)
+        left, top, right, bottom = scene.image_bounds()
+        size_px = round(right - left), round(bottom - top)
+        self._camera = ChipCamera(scene.calibration, size_px, scene.robot.radius_um)
         self._image = self._camera.picture(None)
         self._walls_um = _outlines(scene)
         self._step = 1
@@ -50,8 +52,7 @@ class PageState:
             if changes.get("refined") is not None or changes.get("shift") is not None:
                 refined = self.tick.refined
                 self._image = self._camera.picture(None if refined is None else refined.registration, self.tick.shift)
-        self._step = batch.step
-        self.remarks = batch.remarks
+        self._step, self.remarks = batch.step, batch.remarks
         return events
 
     def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
@@ -117,11 +118,6 @@ class PageState:
     def _pixels(self, points_um: NDArray[np.float64]) -> list[list[float]]:
         found: list[list[float]] = np.round(self._image.to_px(np.asarray(points_um, np.float64)), 1).tolist()
         return found
-
-
-def _size_px(scene: Scene) -> tuple[int, int]:
-    left, top, right, bottom = scene.image_bounds()
-    return round(right - left), round(bottom - top)
 
 
 def _outlines(scene: Scene) -> list[NDArray[np.float64]]:

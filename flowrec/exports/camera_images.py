@@ -112,10 +112,7 @@ class GreyScale:
 
     def __call__(self, image: Image) -> NDArray[np.uint8]:
         """The image (h, w) in 8 bits."""
-        if self._table is None:
-            return image  # type: ignore[return-value]  # of 8 bits
-        scaled: NDArray[np.uint8] = self._table[image]
-        return scaled
+        return image.astype(np.uint8, copy=False) if self._table is None else self._table[image]
 
     @staticmethod
     def text_of(notes: MovieNotes) -> str:

@@ -93,8 +93,8 @@ class _Views:
             visual_bounds=_bounds(ColourBar(self.scene).bounds),
         )
 
-    def plot(self, name: str, *entities: str, prefixes: tuple[str, ...] | None = None) -> Part:
-        """Lines over the whole session."""
+    def plot(self, name: str, *entities: str, prefixes: Sequence[str] = ()) -> Part:
+        """Lines over the whole session, of these sessions or all."""
         if entities[0] in e.OPTIONAL and entities[0] not in self.present:
             return None
         paths = [entity_path(prefix, entity) for prefix in prefixes or self.prefixes for entity in entities]
@@ -106,11 +106,6 @@ class _Views:
             plot_legend=legend_of(visible=legend),
             axis_x=self._time_axis() if legend else None,
         )
-
-    @property
-    def extra(self) -> list[str]:
-        """The entities of the extra topics that are shown."""
-        return sorted(name for name in self.present if name.startswith(f"{e.EXTRA}/"))[:_MOST_EXTRA]
 
     def _time_axis(self) -> rrb.TimeAxis:
         """From the start to the end, and longer for the legend."""
@@ -166,13 +161,13 @@ class _Views:
         words = ", ".join(known)
         return (rrb.Vertical if above > beside else rrb.Horizontal)(*known.values(), name=words[0].upper() + words[1:])
 
-    def texts(self) -> Part:
+    def texts(self) -> Shown:
         """The summary, and behind it the events."""
         paths = [entity_path(prefix, entity) for prefix in self.prefixes for entity in (e.EVENTS, e.OPERATOR)]
         # Hidden by name: an empty list would show the timeline of the view.
         events = events_view(paths, [TimelineColumn(each, visible=False) for each in (e.SESSION_TIME, e.FRAME)])
         summary = rrb.TextDocumentView(name="Summary", origin=entity_path("", e.SUMMARY))
-        return tabs(summary if e.SUMMARY in self.present else None, events)
+        return rrb.Tabs(*([summary] if e.SUMMARY in self.present else []), events, active_tab=0)
 
     @property
     def camera_share(self) -> float:
@@ -189,7 +184,7 @@ class _Views:
             above = rrb.Horizontal(camera, beside, column_shares=[width, 1.0 - width])
         share = self.lanes_px / self.below_px
         right_side = rrb.Vertical(*existing([self.lanes(), tabs(*plots)]), row_shares=[share, 1.0 - share])
-        below = rrb.Horizontal(*existing([self.texts()]), right_side, column_shares=[_SUMMARY, 1.0 - _SUMMARY])
+        below = rrb.Horizontal(self.texts(), right_side, column_shares=[_SUMMARY, 1.0 - _SUMMARY])
         return rrb.Vertical(above, below, row_shares=[_ALL_PX - self.below_px, self.below_px])
 
 
@@ -230,13 +225,13 @@ def _double(v: _Views) -> Shown:
 def _plots(v: _Views) -> tuple[Part, ...]:
     """Three pages of plots: all of a page are seen at once, and no title is cut."""
     single = len(v.prefixes) == 1
-    flow = (
-        [v.plot("Flow at the robot (µm/s)", e.FLOW_SPEED)]
-        if single
-        else [v.plot(f"Flow, {prefix} (µm/s)", e.FLOW_SPEED, prefixes=(prefix,)) for prefix in v.prefixes]
-    )
+    flow = [
+        v.plot("Flow at the robot (µm/s)" if single else f"Flow, {prefix} (µm/s)", e.FLOW_SPEED, prefixes=(prefix,))
+        for prefix in v.prefixes
+    ]
     nis = (e.NIS, e.NIS_MEAN) if e.PULSATION in v.present and single else (e.NIS,)
     frequency = v.plot("Field (Hz)", e.FREQUENCY)
+    extra = sorted(name for name in v.present if name.startswith(f"{e.EXTRA}/"))
     return (
         _row(
             "Robot",
@@ -258,7 +253,7 @@ def _plots(v: _Views) -> tuple[Part, ...]:
             v.plot("Field (mT)", e.AMPLITUDE),
         ),
         _row("Timing", v.plot("Timing (ms)", e.TIMING)),
-        _row("Other topics", *(v.plot(entity.removeprefix(e.EXTRA), entity) for entity in v.extra)),
+        _row("Other topics", *(v.plot(entity.removeprefix(e.EXTRA), entity) for entity in extra[:_MOST_EXTRA])),
     )
 
 

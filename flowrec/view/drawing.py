@@ -45,7 +45,7 @@ class Trail:
 
 
 class Layer:
-    """Lines that stay for many images. Each pixel becomes a x grey level + b.
+    """Lines that stay for many images, as colours with opacities.
 
     Parameters
     ----------
@@ -53,15 +53,14 @@ class Layer:
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        self._kept = np.ones(shape, np.float32)
-        self._added = np.zeros((*shape, 3), np.float32)
+        self._ink = np.zeros((*shape, 4), np.float32)  # BGR times opacity, and opacity
 
     def lines(self, lines: Iterable[Points], heads: Iterable[Points], colour: Rgb, width_px: float) -> None:
         """Polylines, each (n, 2) as x, y, and polygons that are filled."""
         polylines = [_fixed(each) for each in lines if drawable(each)]
         polygons = [_fixed(each) for each in heads]
         for shade, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
-            mask = np.zeros(self._kept.shape, np.uint8)
+            mask = np.zeros(self._ink.shape[:2], np.uint8)
             width = max(round(width_px + rim), 1)
             cv2.polylines(mask, polylines, False, 255, width, cv2.LINE_AA, SUBPIXEL_BITS)
             for each in polygons:
@@ -72,22 +71,21 @@ class Layer:
 
     def blend(self, grey: NDArray[np.uint8], picture: Picture) -> None:
         """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it; nothing is drawn after it."""
-        where, factor, offset = self._finished
-        levels = grey.reshape(-1)[where]
-        picture.reshape(-1, 3)[where] = (levels[:, None] * factor + offset).astype(np.uint8)
+        where, ink = self._finished
+        levels = grey.reshape(-1, 1)[where]
+        picture.reshape(-1, 3)[where] = (levels * (1.0 - ink[:, 3:]) + ink[:, :3] + 0.5).astype(np.uint8)
 
     @functools.cached_property
-    def _finished(self) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
-        """Places of the pixels that have lines, and their a and b, which rounds."""
-        where = np.flatnonzero(self._kept < 1.0)
-        return where, self._kept.reshape(-1, 1)[where], self._added.reshape(-1, 3)[where] + 0.5
+    def _finished(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Places of the pixels that have lines, and their ink."""
+        where = np.flatnonzero(self._ink[..., 3])
+        return where, self._ink.reshape(-1, 4)[where]
 
     def _mix(self, mask: NDArray[np.uint8], colour: Rgb, opacity: float) -> None:
         inked = np.flatnonzero(mask)  # a few percent of the pixels
         alpha = mask.reshape(-1)[inked, None] * np.float32(opacity / 255.0)
-        kept, added = self._kept.reshape(-1, 1), self._added.reshape(-1, 3)
-        kept[inked] *= 1.0 - alpha
-        added[inked] = added[inked] * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32)
+        ink = self._ink.reshape(-1, 4)
+        ink[inked] = ink[inked] * (1.0 - alpha) + alpha * np.array([*bgr(colour), 1.0], np.float32)
 
 
 def arrows(begins: Points, ends: Points, width_px: float) -> tuple[list[Points], list[Points]]:
@@ -125,14 +123,10 @@ def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, co
 
 def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) -> None:
     """Put the pixels of `clean` back within a circle."""
-    x, y = centre.tolist()
-    x0, y0 = max(int(x - radius_px), 0), max(int(y - radius_px), 0)
-    x1, y1 = min(int(x + radius_px) + 2, picture.shape[1]), min(int(y + radius_px) + 2, picture.shape[0])
-    if x0 >= x1 or y0 >= y1:
-        return
-    rows, columns = np.ogrid[y0:y1, x0:x1]
-    inside = (columns - x) ** 2 + (rows - y) ** 2 <= radius_px**2
-    picture[y0:y1, x0:x1][inside] = clean[y0:y1, x0:x1][inside]
+    mask = np.zeros(picture.shape[:2], np.uint8)
+    x, y, radius = np.rint(np.array([*centre, radius_px]) * (1 << SUBPIXEL_BITS)).astype(int).tolist()
+    cv2.circle(mask, (x, y), radius, 255, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
+    cv2.copyTo(clean, mask, picture)
 
 
 def _fixed(points: Points) -> NDArray[np.int32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,13 +84,7 @@ class Style:
     width: float  # of the path; the first session's is wide and below: both are visible where they coincide
     second: bool = False
 
-    @property
-    def line_points(self) -> float:
-        """Width of a line in a plot."""
-        return 1.5 if self.width < _WIDE else self.width
 
-
-_WIDE = 3.0
 _STYLES = {
     "": Style("", colours.CYAN, colours.ORANGE, 1.4),
     "recorded": Style("recorded ", colours.ORANGE, colours.ORANGE, 3.2),
@@ -102,6 +97,7 @@ _STYLES = {
 REPLAY, PAIR = ("recorded", "replayed"), ("A", "B")  # prefixes of two sessions in one view
 
 
+@functools.cache
 def entity_path(prefix: str, entity: str) -> str:
     """The entity's full path, escaped for Rerun; `prefix` is '' or one of REPLAY or PAIR."""
     return new_entity_path([part for part in (prefix, *entity.split("/")) if part])
@@ -120,14 +116,10 @@ class EntityLogger:
         self.prefix = prefix
         self.style = _STYLES[prefix]
         self.present: set[str] = set()
-        self._paths: dict[str, str] = {}
 
     def log(self, entity: str, *components: rr.AsComponents, static: bool = False) -> None:
         """Log the components of an entity at the present time, or (static) for all times."""
-        path = self._paths.get(entity)
-        if path is None:
-            path = self._paths[entity] = entity_path(self.prefix, entity)
-        self.stream.log(path, components[0], *components[1:], static=static)
+        self.stream.log(entity_path(self.prefix, entity), components[0], *components[1:], static=static)
         if not static and (entity in OPTIONAL or entity.startswith(EXTRA)) and not isinstance(components[0], rr.Clear):
             self.present.add(entity)
 
@@ -183,12 +175,11 @@ class EntityLogger:
                 "total (ms)": colours.WHITE,
             },
         }
+        width = max(self.style.width, 1.5)
         for entity, named in lines.items():
             single = bool(self.prefix) and len(named) == 1
             names = [self.prefix] if single else list(named)
-            series = rr.SeriesLines(
-                names=names, colors=list(named.values()), widths=[self.style.line_points] * len(named)
-            )
+            series = rr.SeriesLines(names=names, colors=list(named.values()), widths=[width] * len(named))
             self.log(entity, series, static=True)
 
 
