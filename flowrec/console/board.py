@@ -21,8 +21,8 @@ MOST_PAGES = 8
 _MOST_EVENTS = 100
 
 
-class Contents(NamedTuple):
-    """What a page can show at a moment.
+class PageContents(NamedTuple):
+    """All that a page can show at a moment.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Contents(NamedTuple):
     ended: RunEnded | None
 
 
-NOTHING = Contents({}, {}, b"", 0, None)
+NOTHING = PageContents({}, {}, b"", 0, None)
 
 
 class Board:
@@ -77,7 +77,7 @@ class Board:
             drawing = new_drawing
         if self._pages:
             picture = self._page_state.picture() or picture
-        self._now = Contents(self._page_state.state(), drawing, picture, count, ended)
+        self._now = PageContents(self._page_state.state(), drawing, picture, count, ended)
         self._wake()
 
     def end(self, ended: RunEnded) -> None:
@@ -133,7 +133,7 @@ class Board:
         if not self._pages:
             self.left.set()
 
-    async def news(self, shown: Contents) -> tuple[Contents, str, bytes | None]:
+    async def news(self, shown: PageContents) -> tuple[PageContents, str, bytes | None]:
         """Wait until there is more than a page has shown: all there is; what is new of it, as JSON; a new picture."""
         while shown is self._now:
             await self._changed.wait()

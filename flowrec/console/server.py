@@ -21,7 +21,7 @@ import uvicorn
 from flowrec.console.app import application
 from flowrec.console.board import Board
 from flowrec.console.console import STAYS, Begin, CommandReply, RunEnded
-from flowrec.view import LOOPBACK, received
+from flowrec.view import LOOPBACK, read_feed
 
 PORT = 8460  # where it is free: the operator's tunnel and bookmark stay from run to run
 _NOTHING_SAID = RunEnded("the run's process has ended without a word; flowrec recover makes a session of its file")
@@ -33,7 +33,7 @@ def serve() -> None:
     """Serve until the run has ended."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever else is printed goes to the log
-    source = received()
+    source = read_feed()
     begin: Begin = next(source)
     listening = _listening()
     port = listening.getsockname()[1]

@@ -102,7 +102,7 @@ class _Views:
         return rrb.TimeSeriesView(
             name=name,
             origin=paths[0] if len(paths) == 1 else "/",
-            contents=_shown(paths),
+            contents=_contents(paths),
             plot_legend=legend_of(visible=legend),
             axis_x=self._time_axis() if legend else None,
         )
@@ -117,7 +117,7 @@ class _Views:
 
     def lanes(self) -> Shown:
         """The timeline of states."""
-        return rrb.StateTimelineView(name=self._lanes_name(), origin="/", contents=_shown(self._lane_paths))
+        return rrb.StateTimelineView(name=self._lanes_name(), origin="/", contents=_contents(self._lane_paths))
 
     @property
     def _lane_paths(self) -> list[str]:
@@ -272,7 +272,7 @@ def layout_of(body: Shown, **time: str) -> rrb.Blueprint:
 def events_view(paths: Iterable[str], timeline_columns: Sequence[TimelineColumn] = ()) -> rrb.TextLogView:
     """The events of some entities as a log."""
     columns = rrb.TextLogColumns(timeline_columns=timeline_columns, text_log_columns=["Body"])
-    return rrb.TextLogView(name="Events", origin="/", contents=_shown(paths), columns=columns)
+    return rrb.TextLogView(name="Events", origin="/", contents=_contents(paths), columns=columns)
 
 
 def legend_of(*, visible: bool) -> rrb.PlotLegend:
@@ -297,7 +297,7 @@ def _row(name: str, *parts: Part) -> Part:
     return rrb.Horizontal(*found, name=name) if found else None
 
 
-def _shown(paths: Iterable[str]) -> list[str]:
+def _contents(paths: Iterable[str]) -> list[str]:
     """The contents of a view that shows these entities."""
     return [f"+ {path}" for path in paths]
 

@@ -57,8 +57,8 @@ class Layer:
 
     def lines(self, lines: Iterable[Points], heads: Iterable[Points], colour: Rgb, width_px: float) -> None:
         """Polylines, each (n, 2) as x, y, and polygons that are filled."""
-        polylines = [_fixed(each) for each in lines if drawable(each)]
-        polygons = [_fixed(each) for each in heads]
+        polylines = [to_fixed_point(each) for each in lines if drawable(each)]
+        polygons = [to_fixed_point(each) for each in heads]
         for shade, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
             mask = np.zeros(self._ink.shape[:2], np.uint8)
             width = max(round(width_px + rim), 1)
@@ -108,7 +108,7 @@ def draw_outline(picture: Picture, line: Points, colour: Rgb, width_px: float) -
     """A polyline (n, 2) that is drawn for one image only."""
     for shade, rim in ((SOLID, 1.0), (colour, 0.0)):
         width = max(round(width_px + rim), 1)
-        cv2.polylines(picture, [_fixed(line)], False, bgr(shade), width, cv2.LINE_AA, SUBPIXEL_BITS)
+        cv2.polylines(picture, [to_fixed_point(line)], False, bgr(shade), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
@@ -129,7 +129,7 @@ def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) 
     cv2.copyTo(clean, mask, picture)
 
 
-def _fixed(points: Points) -> NDArray[np.int32]:
+def to_fixed_point(points: Points) -> NDArray[np.int32]:
     """Points (n, 2) in 1/16 px, as OpenCV takes them."""
     return np.rint(points * (1 << SUBPIXEL_BITS)).astype(np.int32).reshape(-1, 1, 2)
 

@@ -257,7 +257,7 @@ class FeedSink:
         self.close()
 
 
-def received() -> Iterator[Any]:
+def read_feed() -> Iterator[Any]:
     """In the process: what it is sent at stdin, until the run has ended, or was killed while it wrote."""
     with contextlib.suppress(EOFError, pickle.UnpicklingError):
         while True:

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 from flowrec.core import Tick, seconds
 from flowrec.view import viewer
-from flowrec.view.feed import Batch, received
+from flowrec.view.feed import Batch, read_feed
 from flowrec.view.scene import Scene
 
 ACCEPTS = "flowrec: accepts viewers"  # what the process says to the run
@@ -39,7 +39,7 @@ def serve() -> None:
     from flowrec.view.summary_text import LiveSummary
 
     port, window = int(sys.argv[1]), sys.argv[2] == "window"
-    source = received()
+    source = read_feed()
     scene: Scene = next(source)
     stream = open_stream(scene)
     present: AbstractSet[str] = frozenset({SUMMARY})

@@ -135,7 +135,7 @@ def _log_all(
 def _merge(sessions: Iterable[Iterable[Tick]]) -> Iterator[tuple[int, int, Tick]]:
     """Stamp, number of the session and tick, in the order of stamps; of equal ones the first session's comes first."""
 
-    def numbered(number: int, ticks: Iterable[Tick]) -> Iterator[tuple[int, int, Tick]]:
+    def label(number: int, ticks: Iterable[Tick]) -> Iterator[tuple[int, int, Tick]]:
         return ((tick.stamp_ns, number, tick) for tick in ticks)
 
-    return heapq.merge(*(numbered(*each) for each in enumerate(sessions)), key=lambda item: item[:2])
+    return heapq.merge(*(label(*each) for each in enumerate(sessions)), key=lambda item: item[:2])

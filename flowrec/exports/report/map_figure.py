@@ -131,16 +131,16 @@ class ChangeFigure:
         mask = data.scene.chip.mask
         named = {"recorded": self._before, "replayed": self._after}
         largest = max(float(np.nanmax(speed(field, mask))) for field in named.values())
-        return draw_panels(_compared(named, ColourScale.up_to(largest, "speed"), mask), data, width_mm)
+        return draw_panels(_panels_of(named, ColourScale.up_to(largest, "speed"), mask), data, width_mm)
 
 
 def _panels(data: ReportData) -> list[Panel]:
     mask, scale = data.scene.chip.mask, data.speed_scale()
-    panels = _compared({"assumed": data.assumed, "refined": data.refined}, scale, mask)
+    panels = _panels_of({"assumed": data.assumed, "refined": data.refined}, scale, mask)
     return [*panels, Panel("true", speed(data.truth, mask), scale)] if data.truth is not None else panels
 
 
-def _compared(named: Mapping[str, FlowField | None], scale: ColourScale, mask: NDArray[np.bool_]) -> list[Panel]:
+def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: NDArray[np.bool_]) -> list[Panel]:
     """The speed of one or two fields, their change, and the deviation that the last one states."""
     known = {name: field for name, field in named.items() if field is not None}
     panels = [Panel(name, speed(field, mask), scale) for name, field in known.items()]
