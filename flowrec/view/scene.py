@@ -67,7 +67,7 @@ class Scene:
         return np.column_stack((scale * axes, self.to_plane((0.0, 0.0)) - _HALF_PX * scale * axes.sum(axis=1)))
 
     def preview_to_plane(self, step: int) -> Matrix:
-        """(2, 3): where a point (x, y, 1) of a camera image lies of which only each `step`-th row and column is shown."""
+        """(2, 3): the same for a camera image of which only each `step`-th row and column is shown."""
         return np.column_stack((step * np.eye(2), np.full(2, _HALF_PX * (1 - step))))
 
     def outlines(self) -> list[NDArray[np.float64]]:
