@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -257,7 +258,7 @@ def _plots(v: _Views) -> tuple[Part, ...]:
     )
 
 
-def layout_of(body: Shown, **time: str) -> rrb.Blueprint:
+def layout_of(body: Shown, **time: Any) -> rrb.Blueprint:
     """A layout of these views alone; `time`: timeline, and whether it plays."""
     return rrb.Blueprint(
         body,

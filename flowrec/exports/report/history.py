@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,6 @@ from flowrec.core import (
     Event,
     FlowField,
     Health,
-    Message,
     Mission,
     OperatorEvent,
     Tick,
@@ -138,9 +138,10 @@ class History:
         for message in tick.news(before, _SHOWN).values():
             self._take(message)
 
-    def _take(self, message: Message) -> None:
+    def _take(self, message: Any) -> None:
         """Take a new message of the last tick."""
-        stamp_ns, now_s = message.stamp_ns, seconds(message.stamp_ns)
+        stamp_ns: int = message.stamp_ns
+        now_s = seconds(stamp_ns)
         match message:
             case Event():
                 self._remark(Remark(now_s, message.text, level=message.level))
