@@ -1,2 +1,3 @@
-from .console import Console as Console, refuse_without_packages as refuse_without_packages
-from .messages import RunEnded as RunEnded
+from .console import (
+    Console as Console, RunEnded as RunEnded, refuse_without_packages as refuse_without_packages,
+)

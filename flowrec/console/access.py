@@ -10,9 +10,9 @@ origin. Ports are not compared with the console's: a tunnel (ssh -L) may have an
 from __future__ import annotations
 
 import hmac
-from http.cookies import CookieError, SimpleCookie
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import HTMLResponse, PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -53,17 +53,16 @@ class Access:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        headers = Headers(scope=scope)
-        host = headers.get("host", "")
-        given = _query_token(scope["query_string"])
+        asked = HTTPConnection(scope)
+        host = asked.headers.get("host", "")
         acts = scope["type"] == "websocket" or scope["method"] not in _READING
-        if host.rsplit(":", 1)[0] not in _HOSTS or (acts and headers.get("origin") != f"http://{host}"):
+        if host.rsplit(":", 1)[0] not in _HOSTS or (acts and asked.headers.get("origin") != f"http://{host}"):
             await self._refuse(scope, receive, send)
-        elif scope["type"] == "http" and scope["path"] == "/" and given is not None and same(given, self._token):
+        elif not acts and scope["path"] == "/" and same(asked.query_params.get("token", ""), self._token):
             welcome = HTMLResponse(_WELCOME)
             welcome.set_cookie(self._cookie, self._token, httponly=True, samesite="strict", path="/")
             await welcome(scope, receive, _with_headers(scope, host, send))
-        elif same(_cookie(headers, self._cookie), self._token):
+        elif same(asked.cookies.get(self._cookie, ""), self._token):
             await self._app(scope, receive, _with_headers(scope, host, send))
         else:
             await self._refuse(scope, receive, send)
@@ -74,19 +73,6 @@ class Access:
             await send({"type": "websocket.close", "code": 1008})  # before it was accepted: the status 403
         else:
             await PlainTextResponse(REFUSED, 403)(scope, receive, _with_headers(scope, "", send))
-
-
-def _query_token(query: bytes) -> str | None:
-    name, found, value = query.decode("latin-1").partition("=")
-    return value if found and name == "token" else None
-
-
-def _cookie(headers: Headers, name: str) -> str:
-    try:
-        found = SimpleCookie(headers.get("cookie", "")).get(name)
-    except CookieError:  # of another program of this machine
-        found = None
-    return found.value if found is not None else ""
 
 
 def _with_headers(scope: Scope, host: str, send: Send) -> Send:

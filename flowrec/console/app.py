@@ -10,7 +10,7 @@ import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -20,7 +20,7 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from flowrec.console.access import Access
-from flowrec.console.board import MOST_PAGES, Board, PageProgress
+from flowrec.console.board import MOST_PAGES, NOTHING, Board
 from flowrec.console.console import GOAL, SPEED
 from flowrec.console.rerun_viewer import RerunViewer
 from flowrec.run import COMMANDS, LONGEST_NOTE, NOTE
@@ -66,7 +66,7 @@ def application(board: Board, token: str, port: int, rerun_port: int | None, ans
         try:
             while True:
                 # The answer waits for the run, the next command for nothing.
-                answering = asyncio.create_task(_answer(socket, commands.take(await socket.receive_text())))
+                answering = asyncio.create_task(_answer(socket, *commands.take(await socket.receive_text())))
                 tasks.add(answering)
                 answering.add_done_callback(tasks.discard)
         except WebSocketDisconnect:
@@ -87,45 +87,29 @@ def application(board: Board, token: str, port: int, rerun_port: int | None, ans
 
 async def _send(board: Board, socket: WebSocket) -> None:
     """Send a page what is new, at most some times per second, until the run has ended."""
-    shown = PageProgress()
+    shown = NOTHING
     with suppress(WebSocketDisconnect, RuntimeError):  # the page was closed
         while True:
-            news = await board.news(shown)
-            shown = news.shown
+            shown, words, picture = await board.news(shown)
             frozen = False
             try:
                 async with asyncio.timeout(_FROZEN_S):
-                    await socket.send_text(news.words)
-                    if news.picture is not None:
-                        await socket.send_bytes(news.picture)
+                    await socket.send_text(words)
+                    if picture is not None:
+                        await socket.send_bytes(picture)
             except TimeoutError:
                 frozen = True
-            if frozen or news.last:
+            if frozen or shown.ended is not None:
                 await socket.close()
                 return
             await asyncio.sleep(_PERIOD_S)
 
 
-async def _answer(socket: WebSocket, given: _Given) -> None:
-    """Tell a page what became of its command, once that is known."""
-    refusal = await given.refusal if given.refusal is not None else given.not_given
+async def _answer(socket: WebSocket, number: Any, refusal: str | Awaitable[str]) -> None:
+    """Tell a page what became of its command with this number, once that is known."""
+    words = {"answers": number, "refusal": refusal if isinstance(refusal, str) else await refusal}
     with suppress(WebSocketDisconnect, RuntimeError):  # the page was closed
-        await socket.send_text(json.dumps({"answers": given.number, "refusal": refusal}))
-
-
-class _Given(NamedTuple):
-    """A command of a page.
-
-    Attributes
-    ----------
-    number : by which the page knows it.
-    refusal : of the run, to be waited for; None: the command was not given.
-    not_given : why.
-    """
-
-    number: Any
-    refusal: Awaitable[str] | None
-    not_given: str = ""
+        await socket.send_text(json.dumps(words))
 
 
 class _Commands:
@@ -135,20 +119,23 @@ class _Commands:
         self._board, self._answer = board, answer
         self._given_s: list[float] = []
 
-    def take(self, text: str) -> _Given:
-        """Hand a message of a page to the run."""
+    def take(self, text: str) -> tuple[Any, str | Awaitable[str]]:
+        """Hand a message of a page to the run; by which number the page knows it, and why it is not done, '' if it is.
+
+        Only the run's own word has to be waited for.
+        """
         number: Any = None
         try:
             asked = json.loads(text)
             number = asked.get("number")
             words = self._words(asked)
-            ticket = self._board.ticket()
+            ticket, refusal = self._board.ticket()
             self._answer({**words, "ticket": ticket})
         except OSError:
-            return _Given(number, None, "the run has ended")
+            return number, "the run has ended"
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            return _Given(number, None, f"not understood: {error}")
-        return _Given(number, self._board.refusal(ticket))
+            return number, f"not understood: {error}"
+        return number, refusal
 
     def _words(self, asked: dict[str, Any]) -> dict[str, Any]:
         name = asked["command"]

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Awaitable
 from typing import Any, NamedTuple
 
-from flowrec.console.messages import CommandReply, RunEnded
+from flowrec.console.console import CommandReply, RunEnded
 from flowrec.console.page_state import Drawing, PageState
 from flowrec.view import Batch, Scene
 
@@ -21,30 +21,23 @@ MOST_PAGES = 8
 _MOST_EVENTS = 100
 
 
-class PageProgress(NamedTuple):
-    """Counters of the latest content that a page has received."""
-
-    number: int = 0
-    drawing: int = 0
-    picture: int = 0
-    event: int = 0
-
-
-class News(NamedTuple):
-    """Content that a page has not received yet.
+class PageContents(NamedTuple):
+    """All that a page can show at a moment.
 
     Attributes
     ----------
-    shown : how far it is with this.
-    words : JSON.
-    picture : its last image; None if it has that.
-    last : the run has ended, and this says so.
+    picture : the last image that was made for pages.
+    events : the number of them so far.
     """
 
-    shown: PageProgress
-    words: str
-    picture: bytes | None
-    last: bool
+    state: dict[str, Any]
+    drawing: Drawing
+    picture: bytes
+    events: int
+    ended: RunEnded | None
+
+
+NOTHING = PageContents({}, {}, b"", 0, None)
 
 
 class Board:
@@ -64,12 +57,8 @@ class Board:
         self.name = name
         self._pages = 0
         self._page_state = PageState(scene)
-        self._at = PageProgress()
-        self._state: dict[str, Any] = {}
-        self._drawing: Drawing = {}
-        self._picture = b""
+        self._now = NOTHING
         self._events: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_MOST_EVENTS)
-        self._ended: RunEnded | None = None
         self._changed = asyncio.Event()
         self._waking = False
         self._tickets = itertools.count(1)
@@ -79,24 +68,21 @@ class Board:
 
     def take(self, batch: Batch) -> None:
         """Take over what has happened."""
-        number, drawing_number, picture_number, event_number = self._at
+        _, drawing, picture, count, ended = self._now
         for event in self._page_state.take(batch):
-            event_number += 1
-            self._events.append((event_number, event))
-        drawing = self._page_state.drawing()
-        if drawing != self._drawing:
-            self._drawing, drawing_number = drawing, drawing_number + 1
-        picture = self._page_state.picture() if self._pages else None
-        if picture is not None:
-            self._picture, picture_number = picture, picture_number + 1
-        self._state = self._page_state.state()
-        self._at = PageProgress(number + 1, drawing_number, picture_number, event_number)
+            count += 1
+            self._events.append((count, event))
+        new_drawing = self._page_state.drawing()
+        if new_drawing != drawing:
+            drawing = new_drawing
+        if self._pages:
+            picture = self._page_state.picture() or picture
+        self._now = PageContents(self._page_state.state(), drawing, picture, count, ended)
         self._wake()
 
     def end(self, ended: RunEnded) -> None:
         """Take over how the run ended."""
-        self._ended = ended
-        self._at = self._at._replace(number=self._at.number + 1)
+        self._now = self._now._replace(ended=ended)
         self._wake()
 
     def settle(self, verdict: CommandReply) -> None:
@@ -115,7 +101,7 @@ class Board:
         self._waking = False
         self._changed.set()
         self._changed = asyncio.Event()
-        if self._ended is not None:
+        if self._now.ended is not None:
             self.over.set()
 
     def _settle(self, verdict: CommandReply) -> None:
@@ -123,15 +109,11 @@ class Board:
         if waiting is not None and not waiting.done():  # done: its page is gone
             waiting.set_result(verdict.refusal)
 
-    def ticket(self) -> int:
-        """A number for a command that is handed to the run, which will say what it made of it."""
+    def ticket(self) -> tuple[int, Awaitable[str]]:
+        """A number for a command that is handed to the run, and why the run does not do it, '' where it does."""
         ticket = next(self._tickets)
         self._verdicts[ticket] = asyncio.get_running_loop().create_future()
-        return ticket
-
-    def refusal(self, ticket: int) -> Awaitable[str]:
-        """Wait for the run: why it does not do a command, '' where it does."""
-        return self._verdicts[ticket]
+        return ticket, self._verdicts[ticket]
 
     def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
         """The place on the chip that the image shows there."""
@@ -151,16 +133,15 @@ class Board:
         if not self._pages:
             self.left.set()
 
-    async def news(self, shown: PageProgress) -> News:
-        """Wait until there is more than a page has shown."""
-        while shown.number == self._at.number:
+    async def news(self, shown: PageContents) -> tuple[PageContents, str, bytes | None]:
+        """Wait until there is more than a page has shown: all there is; what is new of it, as JSON; a new picture."""
+        while shown is self._now:
             await self._changed.wait()
-        at, ended = self._at, self._ended
-        words: dict[str, Any] = {"state": self._state, "name": self.name}
-        if at.drawing != shown.drawing:
-            words["drawing"] = self._drawing
-        words["events"] = [event for number, event in list(self._events) if shown.event < number <= at.event]
-        if ended is not None:
-            words["ended"] = ended._asdict()
-        picture = self._picture if at.picture != shown.picture else None
-        return News(at, json.dumps(words), picture, ended is not None)
+        now = self._now
+        words: dict[str, Any] = {"state": now.state, "name": self.name}
+        if now.drawing is not shown.drawing:
+            words["drawing"] = now.drawing
+        words["events"] = [event for number, event in list(self._events) if shown.events < number <= now.events]
+        if now.ended is not None:
+            words["ended"] = now.ended._asdict()
+        return now, json.dumps(words), now.picture if now.picture is not shown.picture else None

@@ -13,12 +13,11 @@ import secrets
 import threading
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any, Self
+from typing import Any, NamedTuple
 
-from flowrec.console.messages import STAYS, Begin, CommandReply, RunEnded
-from flowrec.core import FlowrecError, Tick, UsageError
+from flowrec.core import FlowrecError, UsageError
 from flowrec.run import COMMANDS, RunControl
-from flowrec.view import Feed, Scene, viewer
+from flowrec.view import Feed, FeedSink, Scene, viewer
 
 PACKAGES = ("starlette", "uvicorn", "websockets")  # of the extra `console`
 GOAL, SPEED = "goal", "speed"  # commands with numbers
@@ -27,6 +26,44 @@ _MAX_HZ = 10.0
 _START_S = 30.0
 _CLOSE_S = 3.0
 _WITHOUT = "the run goes on without"
+STAYS = "flowrec: shows its pages how the run ended"  # what the process says last; it ends by itself a moment later
+
+
+class Begin(NamedTuple):
+    """The first message to the console's process; ticks and replies follow.
+
+    Attributes
+    ----------
+    token : that a browser must know.
+    name : of the session's file.
+    rerun_port : of Rerun's server on this machine; None without one.
+    """
+
+    token: str
+    name: str
+    scene: Scene
+    rerun_port: int | None
+
+
+class CommandReply(NamedTuple):
+    """Answer of the run to a command.
+
+    Attributes
+    ----------
+    ticket : number of the command, as the server counts them.
+    refusal : why the run does not do it; '' where it has taken it.
+    """
+
+    ticket: int
+    refusal: str
+
+
+class RunEnded(NamedTuple):
+    """The last message to the console's process: how the run ended, and where its file is."""
+
+    outcome: str
+    files: str = ""
+    good: bool = False  # it reached its end, or was ended on purpose
 
 
 def refuse_without_packages() -> None:
@@ -36,10 +73,8 @@ def refuse_without_packages() -> None:
             raise UsageError(f"--console needs {package}, which is not installed: pip install 'flowrec[console]'")
 
 
-class Console:
+class Console(FeedSink):
     """A sink that shows the run on a page, and hands what is asked there to `control`.
-
-    Whatever happens to the page or its server, `write` neither waits nor raises.
 
     Parameters
     ----------
@@ -51,6 +86,7 @@ class Console:
     Attributes
     ----------
     port : of the page, once the server accepts browsers.
+    message : how to open the page, or the reason why there is none.
     """
 
     def __init__(
@@ -64,26 +100,21 @@ class Console:
     ) -> None:
         from flowrec.console.page_state import SHOWN
 
+        super().__init__()
         self.port = 0
         self._control, self._tell = control, tell
         self._token = secrets.token_urlsafe(32)
         self._accepts = threading.Event()
-        self._message = f"no console: its server did not start within {_START_S:g} s; {_WITHOUT}"
-        self._feed: Feed | None = None
+        self.message = f"no console: its server did not start within {_START_S:g} s; {_WITHOUT}"
         begin = Begin(self._token, name, scene, rerun_port)
         try:
             self._feed = Feed((_SERVER,), begin, _MAX_HZ, SHOWN, remarks, answers=True)
         except OSError as error:
-            self._message = f"no console: its process does not start ({error.strerror or error}); {_WITHOUT}"
+            self.message = f"no console: its process does not start ({error.strerror or error}); {_WITHOUT}"
             return
         threading.Thread(target=self._hear, args=(self._feed,), name="console", daemon=True).start()
         if not self._accepts.wait(_START_S):
             self._feed.process.kill()
-
-    @property
-    def message(self) -> str:
-        """Instructions to open the page, or the reason why there is none."""
-        return self._message
 
     @property
     def tunnel(self) -> str:
@@ -96,32 +127,9 @@ class Console:
         """The address of the page, with the token."""
         return f"http://{viewer.LOOPBACK}:{self.port}/?token={self._token}"
 
-    @property
-    def pid(self) -> int | None:
-        """The process of the server."""
-        return None if self._feed is None else self._feed.process.pid
-
-    @property
-    def dropped(self) -> int:
-        """Ticks that were not shown."""
-        return 0 if self._feed is None else self._feed.dropped
-
-    def write(self, tick: Tick) -> None:
-        """Take one tick; a few microseconds."""
-        if self._feed is not None:
-            self._feed.write(tick)
-
     def close(self, ended: RunEnded | None = None, timeout_s: float = _CLOSE_S) -> None:
         """Let the pages show how the run ended, within a time limit; then end the server."""
-        feed = self._feed
-        if feed is not None and not feed.closing and feed.close(timeout_s, STAYS, ended):
-            viewer.leave(feed.process)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
+        self._end(timeout_s, STAYS, ended)
 
     def _hear(self, feed: Feed) -> None:
         """Take over what the operator asks, until the process ends: the thread."""
@@ -131,16 +139,16 @@ class Console:
                 words = json.loads(line)
                 if "port" in words:
                     self.port = words["port"]
-                    self._message = f"console: {self.url}"
+                    self.message = f"console: {self.url}"
                     self._accepts.set()
                 else:
                     feed.tell(CommandReply(words["ticket"], self._do(words)))
         if feed.closing:
             return
         feed.process.wait()
-        self._message = f"the console ended ({feed.last_words}); {_WITHOUT}"
+        self.message = f"the console ended ({feed.last_words}); {_WITHOUT}"
         if self._accepts.is_set():
-            self._tell(self._message)
+            self._tell(self.message)
         self._accepts.set()
 
     def _do(self, words: dict[str, Any]) -> str:

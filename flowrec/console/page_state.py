@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import Phase, Tick, printable, seconds, shift_px
 from flowrec.store import ChipCamera
-from flowrec.view import Batch, Scene, state_text
+from flowrec.view import Batch, Scene, encode_jpeg, state_text
 
 # What the page shows depends on these fields of a tick.
 SHOWN = ("frame", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing", "losses")
@@ -34,7 +34,9 @@ class PageState:
         self.tick = Tick()
         self.remarks: dict[str, Any] = {}
         self._scene = scene
-        self._camera = ChipCamera(scene.calibration, _size_px(scene), scene.robot.radius_um)
+        left, top, right, bottom = scene.image_bounds()
+        size_px = round(right - left), round(bottom - top)
+        self._camera = ChipCamera(scene.calibration, size_px, scene.robot.radius_um)
         self._image = self._camera.picture(None)
         self._walls_um = _outlines(scene)
         self._step = 1
@@ -50,8 +52,7 @@ class PageState:
             if changes.get("refined") is not None or changes.get("shift") is not None:
                 refined = self.tick.refined
                 self._image = self._camera.picture(None if refined is None else refined.registration, self.tick.shift)
-        self._step = batch.step
-        self.remarks = batch.remarks
+        self._step, self.remarks = batch.step, batch.remarks
         return events
 
     def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
@@ -104,10 +105,7 @@ class PageState:
         frame = self.tick.frame
         if frame is None or not frame.image.size:
             return None
-        image = frame.image if frame.bits == 8 else (frame.image >> (frame.bits - 8)).astype(np.uint8)
-        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-        assert done
-        return bytes([min(self._step, 255)]) + data.tobytes()
+        return bytes([min(self._step, 255)]) + encode_jpeg(frame.image, frame.bits, _QUALITY)
 
     def _losses(self) -> list[str]:
         timing, losses = self.tick.timing, self.tick.losses
@@ -120,11 +118,6 @@ class PageState:
     def _pixels(self, points_um: NDArray[np.float64]) -> list[list[float]]:
         found: list[list[float]] = np.round(self._image.to_px(np.asarray(points_um, np.float64)), 1).tolist()
         return found
-
-
-def _size_px(scene: Scene) -> tuple[int, int]:
-    left, top, right, bottom = scene.image_bounds()
-    return round(right - left), round(bottom - top)
 
 
 def _outlines(scene: Scene) -> list[NDArray[np.float64]]:

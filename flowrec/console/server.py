@@ -9,10 +9,10 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import pickle
 import socket
 import sys
 import threading
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, TextIO
 
@@ -20,8 +20,8 @@ import uvicorn
 
 from flowrec.console.app import application
 from flowrec.console.board import Board
-from flowrec.console.messages import STAYS, Begin, CommandReply, RunEnded
-from flowrec.view import LOOPBACK
+from flowrec.console.console import STAYS, Begin, CommandReply, RunEnded
+from flowrec.view import LOOPBACK, read_feed
 
 PORT = 8460  # where it is free: the operator's tunnel and bookmark stay from run to run
 _NOTHING_SAID = RunEnded("the run's process has ended without a word; flowrec recover makes a session of its file")
@@ -33,8 +33,8 @@ def serve() -> None:
     """Serve until the run has ended."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever else is printed goes to the log
-    source = sys.stdin.buffer
-    begin: Begin = pickle.load(source)  # noqa: S301 - from our own parent
+    source = read_feed()
+    begin: Begin = next(source)
     listening = _listening()
     port = listening.getsockname()[1]
     board = Board(begin.scene, begin.name)
@@ -56,7 +56,7 @@ def serve() -> None:
     asyncio.run(_serve(server, listening, board, source))
 
 
-async def _serve(server: uvicorn.Server, listening: socket.socket, board: Board, source: Any) -> None:
+async def _serve(server: uvicorn.Server, listening: socket.socket, board: Board, source: Iterator[Any]) -> None:
     board.loop = asyncio.get_running_loop()
     threading.Thread(target=_read, args=(source, board), name="run", daemon=True).start()
     serving = asyncio.create_task(server.serve(sockets=[listening]))
@@ -82,14 +82,10 @@ def _listening() -> socket.socket:
     sys.exit("no port is free")
 
 
-def _read(source: Any, board: Board) -> None:
+def _read(source: Iterator[Any], board: Board) -> None:
     """Take over what the run sends, until it ends: the thread."""
     ended = _NOTHING_SAID
-    while True:
-        try:
-            news = pickle.load(source)  # noqa: S301 - from our own parent
-        except (EOFError, pickle.UnpicklingError):  # the run ended, or was killed while it wrote
-            break
+    for news in source:
         if isinstance(news, RunEnded):
             ended = news
             print(STAYS, flush=True)

@@ -129,6 +129,11 @@ class Tick:
         """The best flow known: refined where there is one, else assumed."""
         return self.refined if self.refined is not None else self.assumed
 
+    def news(self, last: Tick, names: Iterable[str]) -> dict[str, Message]:
+        """The messages in these fields that are new since another tick, by field."""
+        known = ((name, getattr(self, name)) for name in names)
+        return {name: each for name, each in known if each is not None and each is not getattr(last, name)}
+
 
 def topics_of(tick_type: type) -> tuple[Topic, ...]:
     """The topics that the annotations of a tick's fields declare, in order.

@@ -2,19 +2,19 @@ from .export import export as export
 from .formats import EXPORTS as EXPORTS
 from .layout import write_layouts as write_layouts
 from .report import style as style
+from .report.curve_figures import (
+    MotionFigure as MotionFigure, ObserverFigure as ObserverFigure, PathFlowFigure as PathFlowFigure,
+    RecordingFigure as RecordingFigure,
+)
 from .report.curves import Span as Span
 from .report.explanations import GLOSSARY as GLOSSARY, MEANINGS as MEANINGS, sentence as sentence
 from .report.history import Remark as Remark
 from .report.map_figure import ChangeFigure as ChangeFigure, MapFigure as MapFigure
-from .report.motion_figure import MotionFigure as MotionFigure
-from .report.observer_figure import ObserverFigure as ObserverFigure
 from .report.page import (
     Drawn as Drawn, Folded as Folded, Page as Page, ReplayPart as ReplayPart, ReportFigure as ReportFigure,
     ReportTable as ReportTable, SweepPage as SweepPage, as_uri as as_uri, draw_figure as draw_figure, render as render,
 )
 from .report.path_figure import PathFigure as PathFigure
-from .report.path_flow_figure import PathFlowFigure as PathFlowFigure
-from .report.recording_figure import RecordingFigure as RecordingFigure
 from .report.report_data import ReportData as ReportData
 from .report.timeline_figure import TimelineFigure as TimelineFigure, numbered_actions as numbered_actions
 from .rrd import RrdExport as RrdExport, scene_of as scene_of

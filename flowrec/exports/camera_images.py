@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -21,8 +21,10 @@ _DARKEST, _BRIGHTEST = 0.1, 99.9  # percentiles of grey levels that become black
 _OF_CAMERA = ("um_per_px", "angle_deg", "mirror", "centre_um", "exposure_s")  # settings that the images do not tell
 
 
-def with_images(session: Session) -> Iterator[tuple[Tick, Frame]]:
+def with_images(session: Session, progress: Callable[[float], None] = lambda _: None) -> Iterator[tuple[Tick, Frame]]:
     """Ticks with a new image of the camera. Where the camera gave none, or the last one again, there is no row.
+
+    `progress` takes the session time in s since the first tick, of each image that was taken.
 
     Raises
     ------
@@ -36,6 +38,7 @@ def with_images(session: Session) -> Iterator[tuple[Tick, Frame]]:
         last = frame
         if frame.image.size and not _repeats(applied, frame.stamp_ns):
             yield tick, frame
+            progress(seconds(frame.stamp_ns - session.run.first_ns))
     if last is None:
         raise without_frames(session)
 
@@ -109,10 +112,7 @@ class GreyScale:
 
     def __call__(self, image: Image) -> NDArray[np.uint8]:
         """The image (h, w) in 8 bits."""
-        if self._table is None:
-            return image  # type: ignore[return-value]  # of 8 bits
-        scaled: NDArray[np.uint8] = self._table[image]
-        return scaled
+        return image.astype(np.uint8, copy=False) if self._table is None else self._table[image]
 
     @staticmethod
     def text_of(notes: MovieNotes) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from flowrec.core import Coverage, Output, OutputFolder, UsageError, note_written, progress, say, warn, written_sha256
@@ -59,12 +57,15 @@ def export(
     with (
         progress(f"writing {target.name}", length_s, "s") as done,
         input_blamed(session, None, "exported"),
-        _open_output(output) as part,
+        output.new_folder() if isinstance(output, OutputFolder) else output.new_file() as part,
     ):
         exporter.write(session, part, done)
         done(length_s)  # it reads to the end or raises, and tells less often how far
     if isinstance(output, Output):
-        _note(target, facts)
+        try:
+            note_written(target, facts)
+        except OSError as error:  # the export itself is whole
+            warn(f"{target}: its hash can not be kept ({error.strerror or error}): only --overwrite will replace it")
     took_s, amount = time.perf_counter() - began_s, Coverage(length_s, length_s, "s").amount
     say(f"{target} written in {took_s:.1f} s, {amount} of the session; {exporter.advice} {target}")
     return target
@@ -86,16 +87,3 @@ def _target(session: Session, exporter: Exporter, file_format: str, out: Path | 
         return named_beside(session.path, name)
     within = suffix and out.is_dir() and out.suffix not in exporter.suffixes
     return out / name if within else out
-
-
-def _note(target: Path, facts: Mapping[str, str]) -> None:
-    try:
-        note_written(target, facts)
-    except OSError as error:  # the export itself is whole
-        warn(f"{target}: its hash can not be kept ({error.strerror or error}): only --overwrite will replace it")
-
-
-@contextlib.contextmanager
-def _open_output(output: Output | OutputFolder) -> Iterator[Path]:
-    with output.new_folder() if isinstance(output, OutputFolder) else output.new_file() as part:
-        yield part

@@ -7,9 +7,9 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowrec.core import JSON, M_PER_UM, RBL, Output, Topic
+from flowrec.core import JSON, M_PER_UM, RBL, Output
 from flowrec.store import Session, SessionMetadata, files_behind
-from flowrec.view import APPLICATION, Plot, bare_blueprint, foxglove_layout, plot_of
+from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, plot_of
 
 _CAMERA = "/view/camera"
 _LACKS = (
@@ -56,7 +56,10 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
     foxglove.check()
     rerun.check()
     (width_m, height_m), px_m = (M_PER_UM * um for um in session.chip.size_um), M_PER_UM * session.chip.um_per_px
-    plots = {topic.path: plot for topic in session.reader.topics.extra if (plot := _plot_of(session, topic))}
+    found = {
+        topic.path: plot_of(topic, next(session.messages(topic.path), None)) for topic in session.reader.topics.extra
+    }
+    plots = {path: plot for path, plot in found.items() if plot is not None}
     centre_m = 0.5 * (width_m - px_m), 0.5 * (height_m - px_m)
     layout = foxglove_layout(centre_m, max(width_m, height_m), list(plots.values()))
     with SessionMetadata(session.run.files[0].path) as head:
@@ -71,7 +74,3 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
         blueprint.save(APPLICATION, str(part))
     lacks = "" if _CAMERA in present else f"{session.path}: {_LACKS}"
     return Layouts(session.path, foxglove.path, rerun.path, lacks)
-
-
-def _plot_of(session: Session, topic: Topic) -> Plot | None:
-    return plot_of(topic, next(session.messages(topic.path), None))

@@ -52,18 +52,15 @@ class Mp4Export:
         grey = GreyScale.of(session, first)
         size_px = first.image.shape[1], first.image.shape[0]
         windows = WindowCompleter() if session.config.recording.region != "whole" else None
-        scene = Scene(
-            session.chip, session.calibration, session.config.robot, "", image_px=size_px, windows=windows is not None
-        )
+        scene = Scene(session.chip, session.calibration, session.config.robot, "", image_px=size_px)
         overlay = Overlay(scene, size_px)
         notes = notes_of(session, first, grey, drawn=True, zoom=overlay.zoom)
         with Mp4Writer(part, overlay.size_px, notes, session, full_range=False) as writer:
-            for tick, frame in with_images(session):
+            for tick, frame in with_images(session, progress):
                 image = frame.image if windows is None else windows.complete(frame.image)
                 picture = overlay.draw(grey(image), tick)
                 planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8)
                 writer.write(frame.stamp_ns - first.stamp_ns, planes)
-                progress(seconds(frame.stamp_ns - session.run.first_ns))
 
 
 class PlainMp4Export:
@@ -82,10 +79,9 @@ class PlainMp4Export:
         size_px = width + width % 2, height + height % 2
         chroma = np.full((size_px[1] // 2, size_px[0]), 128, np.uint8)
         with Mp4Writer(part, size_px, notes_of(session, first, grey), session, full_range=True) as writer:
-            for _, frame in with_images(session):
-                luma = np.pad(grey(frame.image), padding, mode="edge") if any(map(any, padding)) else grey(frame.image)
+            for _, frame in with_images(session, progress):
+                luma = np.pad(grey(frame.image), padding, mode="edge")
                 writer.write(frame.stamp_ns - first.stamp_ns, np.vstack((luma, chroma)))
-                progress(seconds(frame.stamp_ns - session.run.first_ns))
 
 
 class Mp4Writer:
@@ -107,13 +103,14 @@ class Mp4Writer:
     ) -> None:
         self._encoder = ThreadPoolExecutor(1, "flowrec-mp4")
         self._waiting: deque[Future[None]] = deque()
-        self._full_range = full_range
         rate = Fraction(session.config.camera.rate_hz).limit_denominator(1000)
         self._last: tuple[int, int] = (0, round(1 / rate / TIME_BASE))  # time of the last image, and its interval
         self._container = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
         try:
             self._container.metadata.update(_metadata(notes, session))
-            self._stream = self._container.add_stream("libx264", rate=rate, options=self._options(rate))
+            crf = PLAIN_CRF if full_range else DRAWN_CRF
+            options = {"preset": PRESET, "crf": str(crf), "bf": "0", "g": str(max(round(_KEY_S * rate), 1))}
+            self._stream = self._container.add_stream("libx264", rate=rate, options=options)
             codec = self._stream.codec_context
             codec.width, codec.height = size_px
             codec.pix_fmt, codec.time_base = "yuv420p", TIME_BASE
@@ -123,10 +120,6 @@ class Mp4Writer:
         except BaseException:
             self._abandon()
             raise
-
-    def _options(self, rate: Fraction) -> dict[str, str]:
-        crf = PLAIN_CRF if self._full_range else DRAWN_CRF
-        return {"preset": PRESET, "crf": str(crf), "bf": "0", "g": str(max(round(_KEY_S * rate), 1))}
 
     def __enter__(self) -> Self:
         return self

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.core import DOUBTS, RRD, Output, SessionError
+from flowrec.core import DOUBTS, RRD, SessionError
 from flowrec.physics import Chip
 from flowrec.run import ReplayFiles, before_after
 from flowrec.stages import Pipeline, ResolvedConfig, assemble
@@ -61,23 +61,24 @@ class RrdExport:
         return cls(second)
 
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
-        config, path = session.config, session.path
-        scene = replace(scene_of(config, session.chip, assemble(config, session.chip), path), key=session.key)
-        scene = replace(scene, doubts=str(session.outcome.get(DOUBTS, "")))
+        scene = replace(
+            scene_of(session.config, session.chip, assemble(session.config, session.chip), session.path),
+            key=session.key,
+            doubts=str(session.outcome.get(DOUBTS, "")),
+        )
+        prefixes: tuple[str, ...] = ("",)
+        sessions = [session]
         parent = _parent_of(session)
-        prefixes = REPLAY
         if self._second is not None:
-            prefixes = PAIR
-            ticks, replayed = session.ticks(), self._second.ticks(with_frames=False)
+            prefixes, sessions = PAIR, [session, self._second]
             summary = _pair(session, self._second)
         elif parent is not None:
-            recorded = Session(parent)
-            ticks, replayed = recorded.ticks(), session.ticks(with_frames=False)
-            summary = _comparison(ReplayFiles.of(recorded, session))
+            prefixes, sessions = REPLAY, [Session(parent), session]
+            summary = _comparison(ReplayFiles.of(*sessions))
         else:
-            ticks, replayed = session.ticks(), None
-            summary = document_of_run(path.stem, session.last, session.outcome)
-        write_rrd(Output(part, RRD, overwrite=True), scene, ticks, replayed, progress, prefixes, summary)
+            summary = document_of_run(session.path.stem, session.last, session.outcome)
+        ticks = [each.ticks(with_frames=each is sessions[0]) for each in sessions]
+        write_rrd(part, scene, dict(zip(prefixes, ticks, strict=True)), progress, summary)
 
 
 def _comparison(pair: ReplayFiles) -> rr.TextDocument:

@@ -1,13 +1,16 @@
 """The export formats parquet and csv: a table a topic, streamed, with a datapackage.json that explains each column.
 
-Besides the topics there are a table of each flow field and one of the observed flow, with a row a place.
+Besides the topics there are a table of each flow field and one of the observed flow, with a row a place. Each column
+has its name, type, unit and meaning by the Data Package standard; they come from the metadata of the Arrow schema, so
+from the declarations of the messages. https://datapackage.org/standard/data-package/
 """
 
 from __future__ import annotations
 
 import json
+import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,12 +20,23 @@ import pyarrow.compute
 import pyarrow.csv
 import pyarrow.parquet
 
-from flowrec.core import SessionError, seconds, summary_of
-from flowrec.exports.datapackage import write_datapackage
+from flowrec.core import SessionError, __version__, seconds, summary_of
 from flowrec.store import Session, field_values, observed_flow
 
 _RUN = "^[=+\\-@\t\r'＝＋－＠]"  # what a text begins with that a spreadsheet may take for a formula
 _LEVEL = 1  # of zstd: a quarter of the time of level 3 for a tenth more bytes
+_TYPES = (
+    (pa.types.is_boolean, "boolean"),
+    (pa.types.is_integer, "integer"),
+    (pa.types.is_floating, "number"),
+    (pa.types.is_timestamp, "datetime"),
+    (pa.types.is_string, "string"),
+)
+_MARKED = (
+    " A text that begins with = + - @, a tab, a return or an apostrophe has one more apostrophe before it, so that no "
+    "spreadsheet runs it."
+)
+_MEDIA_TYPES = {".parquet": "application/vnd.apache.parquet", ".csv": "text/csv"}
 
 
 class _Tables:
@@ -34,7 +48,7 @@ class _Tables:
 
     @abstractmethod
     def open_writer(self, path: Path, schema: pa.Schema) -> Any:
-        """A writer of record batches with that schema, as a context manager with `write`."""
+        """A writer of record batches with that schema, as a context manager with `write_batch`."""
 
     def select(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
         """The columns that the format holds."""
@@ -57,14 +71,14 @@ class _Tables:
                     f"{summary_of(known.by_field[topic].type)}; {known.by_field[topic].path}, a row a message",
                 )
             for topic, batch in session.batches(topics):
-                writers[topic].write(self.select(batch))
+                writers[topic].write_batch(self.select(batch))
                 progress(batch.column("time_s")[-1].as_py() - begin_s)
         for name, table, meaning in _places(session):
             with self.open_writer(part / (name + self.suffix), table.schema) as writer:
                 for batch in table.to_batches():
-                    writer.write(batch)
+                    writer.write_batch(batch)
             about[name + self.suffix] = table.schema, meaning
-        write_datapackage(part, session, about)
+        _write_datapackage(part, session, about)
 
 
 def _file_stem(topic: str) -> str:
@@ -90,25 +104,7 @@ class ParquetExport(_Tables):
     advice = "a table a topic, for pandas.read_parquet, DuckDB and others, is in"
 
     def open_writer(self, path: Path, schema: pa.Schema) -> Any:
-        writer = pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", compression_level=_LEVEL)
-        return _Batches(writer)
-
-
-class _Batches:
-    """Adapter of a ParquetWriter to the method names of CSVWriter."""
-
-    def __init__(self, writer: Any) -> None:
-        self._writer = writer
-
-    def write(self, batch: pa.RecordBatch) -> None:
-        """Write one batch as a row group."""
-        self._writer.write_batch(batch)
-
-    def __enter__(self) -> _Batches:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._writer.close()
+        return pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", compression_level=_LEVEL)
 
 
 class CsvExport(_Tables):
@@ -156,3 +152,58 @@ def _is_raster(kind: pa.DataType) -> bool:
     while pa.types.is_nested(kind):
         kind = kind.value_type
     return bool(pa.types.is_float32(kind))
+
+
+def _write_datapackage(folder: Path, session: Session, tables: Mapping[str, tuple[pa.Schema, str]]) -> None:
+    """Write the description of a folder of tables, and beside it the settings and the chip of the session.
+
+    Parameters
+    ----------
+    tables : schema and description of each file, by its name in the folder.
+    """
+    header = session.header
+    (folder / "config.toml").write_text(header.config_toml, encoding="utf-8")
+    (folder / "chip.toml").write_text(header.chip_toml, encoding="utf-8")
+    (folder / "chip.png").write_bytes(header.chip_png)
+    resources: list[dict[str, Any]] = [_resource(name, *about) for name, about in tables.items()]
+    resources += [
+        {"name": "config", "path": "config.toml", "description": "settings of the run"},
+        {"name": "chip", "path": "chip.png", "description": "mask of the chip: white is fluid"},
+        {"name": "chip_openings", "path": "chip.toml", "description": "scale, openings and fluid of the chip"},
+    ]
+    package = {
+        "$schema": "https://datapackage.org/profiles/2.0/datapackage.json",
+        "name": re.sub(r"[^a-z0-9._-]", "_", session.path.stem.lower()) or "session",
+        "title": f"flowrec session {session.path.name}",
+        "description": (
+            "Chip frame: origin at the centre of the mask's pixel (0, 0), x right, y down. stamp_ns and time_s are "
+            "times on the session clock."
+        )
+        + (_MARKED if any(name.endswith(".csv") for name in tables) else ""),
+        "sources": [{"title": session.path.name, "path": session.path.name}],
+        "provenance": dict(session.provenance),
+        "outcome": dict(session.outcome),
+        "exported_by": f"flowrec {__version__}",
+        "resources": resources,
+    }
+    (folder / "datapackage.json").write_text(json.dumps(package, indent=1), encoding="utf-8")
+
+
+def _resource(name: str, schema: pa.Schema, description: str) -> dict[str, Any]:
+    path = Path(name)
+    return {
+        "name": path.stem,
+        "path": name,
+        "format": path.suffix[1:],
+        "mediatype": _MEDIA_TYPES[path.suffix],
+        "description": description,
+        "schema": {"fields": [_field(each) for each in schema]},
+    }
+
+
+def _field(field: pa.Field) -> dict[str, str]:
+    kind = next((name for is_kind, name in _TYPES if is_kind(field.type)), "array")
+    metadata = field.metadata or {}
+    found = {"name": field.name, "type": kind}
+    found |= {"unit": metadata[b"unit"].decode()} if metadata.get(b"unit") else {}
+    return found | {"description": metadata.get(b"meaning", b"").decode()}

@@ -36,7 +36,7 @@ class TiffExport:
         notes = notes_of(session, first, GreyScale(first.bits, 0, (1 << first.bits) - 1))
         with tifffile.TiffWriter(part, bigtiff=first.image.nbytes * len(stamps) > _BIG_BYTES, ome=True) as file:
             file.write(
-                self._images(session, stamps, progress),
+                _images(session, stamps, progress),
                 shape=(len(stamps), height, width),
                 dtype=first.image.dtype,
                 photometric="minisblack",
@@ -50,19 +50,19 @@ class TiffExport:
                 software=f"flowrec {session.provenance.get('flowrec', '')}".strip(),
             )
 
-    def _images(self, session: Session, stamps: list[int], progress: Callable[[float], None]) -> Iterator[Image]:
-        """The images that the file was made for, one after another."""
-        number = 0
-        for _, frame in with_images(session):
-            if number == len(stamps) or frame.stamp_ns != stamps[number]:
-                break
-            progress(seconds(frame.stamp_ns - session.run.first_ns))
-            yield frame.image
-            number += 1
-        if number != len(stamps):
-            raise SessionError(
-                f"{session.path}: its index names {len(stamps)} images, {number} are there; flowrec check says more"
-            )
+
+def _images(session: Session, stamps: list[int], progress: Callable[[float], None]) -> Iterator[Image]:
+    """The images that the file was made for, one after another."""
+    number = 0
+    for _, frame in with_images(session, progress):
+        if number == len(stamps) or frame.stamp_ns != stamps[number]:
+            break
+        yield frame.image
+        number += 1
+    if number != len(stamps):
+        raise SessionError(
+            f"{session.path}: its index names {len(stamps)} images, {number} are there; flowrec check says more"
+        )
 
 
 def _metadata(session: Session, notes: MovieNotes, stamps: list[int]) -> dict[str, Any]:

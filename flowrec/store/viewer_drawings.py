@@ -32,8 +32,8 @@ _ROBOT, _UNSEEN, _PATH, _GOAL = (255, 112, 32, 255), (200, 200, 200, 255), (0, 2
 
 def transforms(stamp_ns: int, scene: ViewerScene) -> Payload:
     """Coordinate frames of chip and cameras."""
-    stamp, parts = scene.stamp(stamp_ns), [transform.encode() for transform in scene.transforms()]
-    return tuple(byte_field_head(_TRANSFORMS, len(stamp) + len(part)) + stamp + part for part in parts)
+    stamp = scene.stamp(stamp_ns)
+    return tuple(part for each in scene.transforms() for part in _part(_TRANSFORMS, stamp, each.encode()))
 
 
 def camera(picture: Picture, _scene: ViewerScene) -> Payload:
@@ -68,19 +68,17 @@ def path(route: Route, _scene: ViewerScene) -> Payload:
 
 def path_points(route: Route, _scene: ViewerScene) -> Payload:
     """The route as points on the chip, in m."""
-    return (_cloud(route.waypoints_um, _PATH, _pose(0.0, 0.0)).encode(),)
+    return (_cloud(route.waypoints_um, _PATH).encode(),)
 
 
 def goal_points(_stamp_ns: int, scene: ViewerScene) -> Payload:
     """A ring with a cross around the goal; nothing without one."""
-    if scene.goal_um is None:
-        return (_cloud(np.zeros((0, 2)), _GOAL, _pose(0.0, 0.0)).encode(),)
-    ring_um = _RADII_OF_GOAL * scene.robot_um
-    across = np.linspace(-1.0, 1.0, _RING_POINTS // 2)
-    cross = np.concatenate((np.outer(across, (1.0, 0.0)), np.outer(across, (0.0, 1.0))))
-    return (
-        _cloud(scene.goal_um + ring_um * np.concatenate((_circle_points(), cross)), _GOAL, _pose(0.0, 0.0)).encode(),
-    )
+    points = np.zeros((0, 2))
+    if scene.goal_um is not None:
+        across = np.linspace(-1.0, 1.0, _RING_POINTS // 2)
+        cross = np.concatenate((np.outer(across, (1.0, 0.0)), np.outer(across, (0.0, 1.0))))
+        points = scene.goal_um + _RADII_OF_GOAL * scene.robot_um * np.concatenate((_circle_points(), cross))
+    return (_cloud(points, _GOAL).encode(),)
 
 
 def route_mark(stamp_ns: int, scene: ViewerScene) -> Payload:
@@ -164,7 +162,7 @@ def _pose_field(x_um: float, y_um: float) -> bytes:
 @functools.lru_cache(maxsize=8)
 def _ring(radius_um: float, rgba: Rgba) -> bytes:
     """The points about the robot, without their pose."""
-    data: bytes = _cloud(_RING_RADII * radius_um * _circle_points(), rgba, None).encode()
+    data: bytes = _cloud(_RING_RADII * radius_um * _circle_points(), rgba, placed=False).encode()
     return data
 
 
@@ -173,7 +171,8 @@ def _circle_points() -> NDArray[np.float64]:
     return np.stack((np.cos(angle), np.sin(angle)), 1)
 
 
-def _cloud(points_um: NDArray[np.float64], rgba: Rgba, pose: fg.Pose | None) -> fg.PointCloud:
+def _cloud(points_um: NDArray[np.float64], rgba: Rgba, *, placed: bool = True) -> fg.PointCloud:
+    """Points (n, 2) on the chip; they are about a pose that follows where they are not `placed`."""
     points = np.zeros(len(points_um), [("at", "<f4", 3), ("colour", "u1", 4)])
     points["at"][:, :2], points["colour"] = M_PER_UM * points_um, rgba
     colours = [
@@ -182,7 +181,7 @@ def _cloud(points_um: NDArray[np.float64], rgba: Rgba, pose: fg.Pose | None) -> 
     ]
     return fg.PointCloud(
         frame_id=CHIP,
-        pose=pose,
+        pose=_pose(0.0, 0.0) if placed else None,
         point_stride=points.itemsize,
         fields=_float_fields("x", "y", "z") + colours,
         data=points.tobytes(),
@@ -199,7 +198,7 @@ def _circle(stamp: bytes, place_px: tuple[float, float], radius_px: float, width
     x, y = place_px
     place = foxglove_schema("CircleAnnotation").wire(position={"x": x, "y": y}).SerializeToString()
     look = _circle_look(radius_px, width_px, rgba)
-    return byte_field_head(_CIRCLES, len(stamp) + len(place) + len(look)), stamp, place, look
+    return _part(_CIRCLES, stamp, place, look)
 
 
 @functools.lru_cache(maxsize=8)
@@ -219,8 +218,12 @@ def _line(stamp: bytes, points_px: NDArray[np.float64], kind: str, width_px: int
         fill_color={},
         thickness=_thickness(width_px),
     )
-    data = line.SerializeToString()
-    return byte_field_head(_POINTS, len(stamp) + len(data)), stamp, data
+    return _part(_POINTS, stamp, line.SerializeToString())
+
+
+def _part(number: int, *content: bytes) -> Payload:
+    """A message as the field of another one with this number."""
+    return byte_field_head(number, sum(map(len, content))), *content
 
 
 def _thickness(width_px: int) -> float:

@@ -7,6 +7,7 @@ All are derived for viewers; evaluations use the recorded messages, which have a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -60,17 +61,9 @@ ROUTE_FLOW = plot_schema(
 
 def robot_flow(robot: Estimate | Track, scene: ViewerScene) -> Payload:
     """The flow where the robot is."""
-    x_um, y_um = scene.place_um(robot.position_um)
-    u, v = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
-    map_u, map_v = _map_at(scene, x_um, y_um)
-    data: bytes = ROBOT_FLOW.wire(
-        x_um=x_um,
-        y_um=y_um,
-        flow_um_s=math.hypot(u, v),
-        map_um_s=math.hypot(map_u, map_v),
-        difference_um_s=math.hypot(u - map_u, v - map_v),
-        map_error_share=scene.map_error_share,
-    ).SerializeToString()
+    flow = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
+    numbers, _ = _beside_map(scene, scene.place_um(robot.position_um), flow)
+    data: bytes = ROBOT_FLOW.wire(**numbers, map_error_share=scene.map_error_share).SerializeToString()
     return (data,)
 
 
@@ -79,19 +72,15 @@ def observation(observations: Observations, scene: ViewerScene) -> Payload:
     count = len(observations.position_um)
     if not count:
         return (OBSERVATION.wire(count=0).SerializeToString(),)
-    (x_um, y_um), (u, v) = scene.place_um(observations.position_um[-1]), observations.flow_um_s[-1].tolist()
-    map_u, map_v = _map_at(scene, x_um, y_um)
+    u, v = flow = observations.flow_um_s[-1].tolist()
+    numbers, (map_u, map_v) = _beside_map(scene, scene.place_um(observations.position_um[-1]), flow)
     data: bytes = OBSERVATION.wire(
-        x_um=x_um,
-        y_um=y_um,
+        **numbers,
         flow_x_um_s=u,
         flow_y_um_s=v,
-        flow_um_s=math.hypot(u, v),
         std_um_s=observations.std_um_s[-1],
         map_x_um_s=map_u,
         map_y_um_s=map_v,
-        map_um_s=math.hypot(map_u, map_v),
-        difference_um_s=math.hypot(u - map_u, v - map_v),
         count=count,
     ).SerializeToString()
     return (data,)
@@ -122,11 +111,20 @@ def route_flow(route: Route, scene: ViewerScene) -> Payload:
     return (data,)
 
 
-def _map_at(scene: ViewerScene, x_um: float, y_um: float) -> tuple[float, float]:
-    """The map's flow at a place on the chip; NaN without a map."""
-    if scene.field is None or not (math.isfinite(x_um) and math.isfinite(y_um)):
-        return math.nan, math.nan
-    from flowrec.physics import sample  # late, as above
+def _beside_map(
+    scene: ViewerScene, place_um: tuple[float, float], flow: Sequence[float]
+) -> tuple[dict[str, float], tuple[float, float]]:
+    """A place on the chip and the flow (2,) there, compared with the map's; and the map's, NaN without a map."""
+    (x_um, y_um), (u, v), map_u, map_v = place_um, flow, math.nan, math.nan
+    if scene.field is not None and math.isfinite(x_um) and math.isfinite(y_um):
+        from flowrec.physics import sample  # late, as above
 
-    u, v = sample(scene.field, (x_um, y_um)).tolist()
-    return u, v
+        map_u, map_v = sample(scene.field, (x_um, y_um)).tolist()
+    numbers = {
+        "x_um": x_um,
+        "y_um": y_um,
+        "flow_um_s": math.hypot(u, v),
+        "map_um_s": math.hypot(map_u, map_v),
+        "difference_um_s": math.hypot(u - map_u, v - map_v),
+    }
+    return numbers, (map_u, map_v)

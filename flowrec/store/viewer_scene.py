@@ -20,7 +20,7 @@ from typing import TypeVar
 
 import numpy as np
 from foxglove import messages as fg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from flowrec.core import M_PER_UM, FlowField, FlowrecError, Matrix, Message, Mission, Route, Shift, shift_px
 from flowrec.physics import Calibration, on_chip
@@ -56,21 +56,6 @@ class Picture:
         return math.sqrt(abs(self._determinant))
 
     @property
-    def mirrored(self) -> bool:
-        """True if the chip is seen as in a mirror."""
-        return self._determinant < 0.0
-
-    @property
-    def focal_px(self) -> float:
-        """Focal length of the pinhole camera."""
-        return HEIGHT_M / (self.um_per_px * M_PER_UM)
-
-    @property
-    def angle_rad(self) -> float:
-        """Direction of the rows of pixels on the chip, from its x to its y axis."""
-        return math.atan2(self.matrix[1, 0], self.matrix[0, 0])
-
-    @property
     def _determinant(self) -> float:
         (a, b, _), (c, d, _) = self.matrix.tolist()
         return float(a * d - b * c)
@@ -93,8 +78,8 @@ class Picture:
         return xx * x_um + xy * y_um + x0, yx * x_um + yy * y_um + y0
 
     def calibration(self) -> fg.CameraCalibration:
-        """The pinhole camera; its principal point is the middle of the image."""
-        f, cx, cy = self.focal_px, 0.5 * self.width_px, 0.5 * self.height_px
+        """The pinhole camera: focal length by its height, principal point in the middle of the image."""
+        f, cx, cy = HEIGHT_M / (self.um_per_px * M_PER_UM), 0.5 * self.width_px, 0.5 * self.height_px
         return fg.CameraCalibration(
             frame_id=self.frame,
             width=self.width_px,
@@ -108,10 +93,12 @@ class Picture:
         """Pose of the pinhole camera: over the middle of the image, or behind it if that is mirrored."""
         middle = np.array([0.5 * self.width_px - _HALF_PX, 0.5 * self.height_px - _HALF_PX, 1.0])
         x, y = (M_PER_UM * (self.matrix @ middle)).tolist()
-        sin, cos = math.sin(0.5 * self.angle_rad), math.cos(0.5 * self.angle_rad)
-        # A turn about z; of a mirrored picture half a turn about x before it.
-        turn = {"x": cos, "y": sin, "z": 0.0, "w": 0.0} if self.mirrored else {"x": 0.0, "y": 0.0, "z": sin, "w": cos}
-        height = HEIGHT_M if self.mirrored else -HEIGHT_M
+        angle_rad = math.atan2(self.matrix[1, 0], self.matrix[0, 0])  # of the rows of pixels, from x to y
+        sin, cos = math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)
+        # A turn about z; of a picture that shows the chip as in a mirror half a turn about x before it.
+        turn, height = {"x": 0.0, "y": 0.0, "z": sin, "w": cos}, -HEIGHT_M
+        if self._determinant < 0.0:
+            turn, height = {"x": cos, "y": sin, "z": 0.0, "w": 0.0}, HEIGHT_M
         return fg.FrameTransform(
             parent_frame_id=CHIP,
             child_frame_id=self.frame,
@@ -196,12 +183,8 @@ class ViewerScene:
         share = self.field.error_share if self.field is not None else None
         return math.nan if share is None else share
 
-    def on_chip(self, measured_um: ArrayLike) -> NDArray[np.float64]:
-        """Places on the chip, in um, of measured places (..., 2) in um."""
-        return on_chip(self._refined.registration if self._refined is not None else None, measured_um)
-
     def place_um(self, measured_um: NDArray[np.float64]) -> tuple[float, float]:
-        """Place on the chip of one measured place (2,), quicker than `on_chip`."""
+        """Place on the chip of one measured place (2,), quicker than `on_chip` of flowrec.physics."""
         x, y = measured_um.tolist()
         if self._refined is None or self._refined.registration is None:
             return x, y
@@ -220,14 +203,13 @@ class ViewerScene:
                 if name == "refined" or self._refined is None:
                     self.field = field
                 self.map = _map(field) or self.map
-        shift, refined = messages.get("shift"), self._refined
+        shift, route, mission = (messages.get(name) for name in ("shift", "route", "mission"))
         if isinstance(shift, Shift):
             self._shift = shift
+        refined = self._refined
         moved = isinstance(shift, Shift) or (refined is not None and refined is messages.get("refined"))
         if moved and self.camera is not None:
-            registration = self._refined.registration if self._refined is not None else None
-            self.picture = self.camera.picture(registration, self._shift)
-        route, mission = messages.get("route"), messages.get("mission")
+            self.picture = self.camera.picture(None if refined is None else refined.registration, self._shift)
         if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
             self.route = route
         if isinstance(mission, Mission):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -15,7 +16,7 @@ from flowrec.view import colours
 from flowrec.view import entities as e
 from flowrec.view.entities import entity_path, points
 from flowrec.view.maps import ColourBar
-from flowrec.view.scene import Scene
+from flowrec.view.scene import Box, Scene
 
 _SEVERAL_LINES = frozenset({e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
 _OVERLAYS = (e.OUTLINE, e.PATH, e.ROBOT)  # of each map, for orientation
@@ -26,10 +27,9 @@ _FEW_LANES, _MOST_LANES = 2, 5  # more than few make the area below higher; more
 _MOST_EXTRA = 6  # plots of extra topics beside each other
 _TITLE_PX = 28.0
 _LEGEND_LIVE_S = 6.0  # least time kept free for a legend in a view that follows the run
-_LEGEND = 0.5  # of the time shown, kept free for a legend beside the curves
+LEGEND = 0.5  # of the time shown, kept free for a legend beside the curves
 Shown = rrb.View | rrb.Container
 Part = Shown | None
-Box = tuple[float, float, float, float]
 
 
 def blueprint(
@@ -45,22 +45,15 @@ def blueprint(
     Parameters
     ----------
     prefixes : ("",), or those of two sessions, see entities.py.
-    present : what was logged (see `TickLogger.present`), of the second session after its prefix and a space; views
-        that would be empty are left out.
+    present : what was logged (see `EntityLogger.present`, and SUMMARY), of the second session after its prefix and a
+        space; views that would be empty are left out.
     end_s : of the session so far.
     phases : of each session, see StateLogger.
     live : the view follows the run; otherwise it opens at the start and plays.
     """
     views = _Views(scene, present, prefixes, end_s, tuple(phases), live)
     body = _single(views) if len(prefixes) == 1 else _double(views)
-    return rrb.Blueprint(
-        body,
-        rrb.TimePanel(state="collapsed", timeline=e.SESSION_TIME, play_state="following" if live else "playing"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_layout=False,
-        auto_views=False,
-    )
+    return layout_of(body, timeline=e.SESSION_TIME, play_state="following" if live else "playing")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,56 +76,49 @@ class _Views:
             visual_bounds=_bounds(self.scene.shown_bounds()),
         )
 
-    def map(self, name: str, entity: str, scale: str, needs: str, prefix: str = "") -> Part:
+    def map(self, name: str, entity: str, prefix: str = "") -> Part:
         """A map with its colour bar and the overlays."""
-        if needs not in self.present:
+        if not self._has(prefix, entity):
             return None
         overlays = [f"+ {entity_path(prefix, overlay)}" for overlay in _OVERLAYS]
         return rrb.Spatial2DView(
             name=name,
             origin=entity_path(prefix, entity.rsplit("/", 1)[0]),
-            contents=["+ $origin/**", f"+ {entity_path(prefix, scale)}/**", *overlays],
+            contents=["+ $origin/**", f"+ {entity_path(prefix, e.SCALES[entity])}/**", *overlays],
             # Thin, because a map is small, and the fastest flow is usually along the path.
             overrides={
                 entity_path(prefix, each): rr.LineStrips2D.from_fields(radii=points(radius))
                 for each, radius in ((e.PATH, 0.6), (e.ROBOT, 0.9))
             },
             background=colours.SOLID,
-            visual_bounds=_bounds(ColourBar.beside(self.scene).bounds_with(self.scene)),
+            visual_bounds=_bounds(ColourBar(self.scene).bounds),
         )
 
-    def plot(self, name: str, *entities: str, needs: str = "", prefixes: tuple[str, ...] | None = None) -> Part:
-        """Lines over the whole session."""
-        if needs and needs not in self.present:
+    def plot(self, name: str, *entities: str, prefixes: Sequence[str] = ()) -> Part:
+        """Lines over the whole session, of these sessions or all."""
+        if entities[0] in e.OPTIONAL and entities[0] not in self.present:
             return None
         paths = [entity_path(prefix, entity) for prefix in prefixes or self.prefixes for entity in entities]
         legend = len(paths) > 1 or entities[0] in _SEVERAL_LINES  # the title suffices for a single line
         return rrb.TimeSeriesView(
             name=name,
             origin=paths[0] if len(paths) == 1 else "/",
-            contents=[f"+ {path}" for path in paths],
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+            contents=_contents(paths),
+            plot_legend=legend_of(visible=legend),
             axis_x=self._time_axis() if legend else None,
         )
 
-    @property
-    def extra(self) -> list[str]:
-        """The entities of the extra topics that are shown."""
-        return sorted(name for name in self.present if name.startswith(f"{e.EXTRA}/"))[:_MOST_EXTRA]
-
     def _time_axis(self) -> rrb.TimeAxis:
         """From the start to the end, and longer for the legend."""
-        end = rr.TimeRangeBoundary.absolute(seconds=(1.0 + _LEGEND) * self.end_s)
+        end = rr.TimeRangeBoundary.absolute(seconds=(1.0 + LEGEND) * self.end_s)
         if self.live:
-            end = rr.TimeRangeBoundary.cursor_relative(seconds=max(_LEGEND * self.end_s, _LEGEND_LIVE_S))
+            end = rr.TimeRangeBoundary.cursor_relative(seconds=max(LEGEND * self.end_s, _LEGEND_LIVE_S))
         start = rr.TimeRangeBoundary.absolute(seconds=0.0)
         return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
 
     def lanes(self) -> Shown:
         """The timeline of states."""
-        return rrb.StateTimelineView(
-            name=self._lanes_name(), origin="/", contents=[f"+ {path}" for path in self._lane_paths]
-        )
+        return rrb.StateTimelineView(name=self._lanes_name(), origin="/", contents=_contents(self._lane_paths))
 
     @property
     def _lane_paths(self) -> list[str]:
@@ -164,39 +150,25 @@ class _Views:
             return False
         return (f"{prefix} {name}" if second else name) in self.present
 
-    def pair(self, **maps: Part) -> Part:
+    def pair(self, maps: Mapping[str, Part]) -> Part:
         """Maps that are seen at once, by the word of each, arranged so that they are largest."""
-        existing = {word.replace("_", " "): shown for word, shown in maps.items() if shown is not None}
-        if not existing:
+        known = {word: shown for word, shown in maps.items() if shown is not None}
+        if not known:
             return None
-        left, top, right, bottom = ColourBar.beside(self.scene).bounds_with(self.scene)
+        left, top, right, bottom = ColourBar(self.scene).bounds
         width_px, height_px = (1.0 - self.camera_share) * _WIDTH_PX, _ALL_PX - self.below_px - 2.0 * _TITLE_PX
         beside = min(0.5 * width_px / (right - left), height_px / (bottom - top))
         above = min(width_px / (right - left), 0.5 * (height_px - _TITLE_PX) / (bottom - top))
-        words = ", ".join(existing)
-        return (rrb.Vertical if above > beside else rrb.Horizontal)(
-            *existing.values(), name=words[0].upper() + words[1:]
-        )
+        words = ", ".join(known)
+        return (rrb.Vertical if above > beside else rrb.Horizontal)(*known.values(), name=words[0].upper() + words[1:])
 
-    def texts(self) -> Part:
+    def texts(self) -> Shown:
         """The summary, and behind it the events."""
         paths = [entity_path(prefix, entity) for prefix in self.prefixes for entity in (e.EVENTS, e.OPERATOR)]
-        events = rrb.TextLogView(
-            name="Events",
-            origin="/",
-            contents=[f"+ {path}" for path in paths],
-            columns=rrb.TextLogColumns(
-                # Hidden by name: an empty list would show the timeline of the view.
-                timeline_columns=[TimelineColumn(each, visible=False) for each in (e.SESSION_TIME, e.FRAME)],
-                text_log_columns=["Body"],
-            ),
-        )
-        summary = rrb.TextDocumentView(name="Summary", origin=entity_path("", e.SUMMARY)) if self._summary else None
-        return _tabs(summary, events)
-
-    @property
-    def _summary(self) -> bool:
-        return "summary" in self.present
+        # Hidden by name: an empty list would show the timeline of the view.
+        events = events_view(paths, [TimelineColumn(each, visible=False) for each in (e.SESSION_TIME, e.FRAME)])
+        summary = rrb.TextDocumentView(name="Summary", origin=entity_path("", e.SUMMARY))
+        return rrb.Tabs(*([summary] if e.SUMMARY in self.present else []), events, active_tab=0)
 
     @property
     def camera_share(self) -> float:
@@ -209,26 +181,22 @@ class _Views:
         """Camera and maps above; below the summary, and beside it the states over the plots."""
         width = self.camera_share
         above: Shown = camera
-        if beside := _tabs(*maps):
+        if beside := tabs(*maps):
             above = rrb.Horizontal(camera, beside, column_shares=[width, 1.0 - width])
         share = self.lanes_px / self.below_px
-        right_side = rrb.Vertical(*_existing([self.lanes(), _tabs(*plots)]), row_shares=[share, 1.0 - share])
-        below = rrb.Horizontal(*_existing([self.texts()]), right_side, column_shares=[_SUMMARY, 1.0 - _SUMMARY])
+        right_side = rrb.Vertical(*existing([self.lanes(), tabs(*plots)]), row_shares=[share, 1.0 - share])
+        below = rrb.Horizontal(self.texts(), right_side, column_shares=[_SUMMARY, 1.0 - _SUMMARY])
         return rrb.Vertical(above, below, row_shares=[_ALL_PX - self.below_px, self.below_px])
 
 
 def _single(v: _Views) -> Shown:
     camera = v.camera("Robot (orange), route (cyan), flow", ["$origin/**"], entity_path("", "camera"))
-    assumed = v.map("Assumed flow", e.ASSUMED, e.SPEED_SCALE, "assumed")
-    refined = v.map("Refined flow", e.REFINED, e.SPEED_SCALE, "refined")
-    change = v.map("Refined - assumed", e.CHANGE, e.CHANGE_SCALE, "change")
-    uncertainty = v.map("Uncertainty (1 σ)", e.UNCERTAINTY, e.UNCERTAINTY_SCALE, "uncertainty")
-    truth = v.map("True flow", e.TRUE, e.SPEED_SCALE, "truth")
-    to_go = v.map("Time to go", e.TIME_TO_GO, e.TIME_TO_GO_SCALE, "time to go")
     maps = (
-        v.pair(assumed=assumed, refined=refined),
-        v.pair(change=change, uncertainty=uncertainty),
-        v.pair(truth=truth, time_to_go=to_go),
+        v.pair({"assumed": v.map("Assumed flow", e.ASSUMED), "refined": v.map("Refined flow", e.REFINED)}),
+        v.pair(
+            {"change": v.map("Refined - assumed", e.CHANGE), "uncertainty": v.map("Uncertainty (1 σ)", e.UNCERTAINTY)}
+        ),
+        v.pair({"truth": v.map("True flow", e.TRUE), "time to go": v.map("Time to go", e.TIME_TO_GO)}),
     )
     return v.layout(camera, maps, _plots(v))
 
@@ -241,16 +209,16 @@ def _double(v: _Views) -> Shown:
         [f"+ /{old}/camera/**", f"+ /{new}/camera/**", *(f"- {path}" for path in hidden)],
         f"/{old}/camera",
     )
-    was = v.map(f"Refined, {old}", e.REFINED, e.SPEED_SCALE, "refined", old)
-    now = v.map(f"Refined, {new}", e.REFINED, e.SPEED_SCALE, f"{new} refined", new)
-    uncertainty = v.map(f"Uncertainty, {new} (1 σ)", e.UNCERTAINTY, e.UNCERTAINTY_SCALE, f"{new} uncertainty", new)
-    assumed = v.map("Assumed flow", e.ASSUMED, e.SPEED_SCALE, "assumed", old)
-    truth = v.map("True flow", e.TRUE, e.SPEED_SCALE, "truth", old)
-    to_go = v.map(f"Time to go, {new}", e.TIME_TO_GO, e.TIME_TO_GO_SCALE, f"{new} time to go", new)
+    refined = {
+        f"refined {old}": v.map(f"Refined, {old}", e.REFINED, old),
+        new: v.map(f"Refined, {new}", e.REFINED, new),
+    }
+    uncertainty = v.map(f"Uncertainty, {new} (1 σ)", e.UNCERTAINTY, new)
+    to_go = v.map(f"Time to go, {new}", e.TIME_TO_GO, new)
     maps = (
-        v.pair(**{f"refined {old}": was, new: now}),
-        v.pair(uncertainty=uncertainty, assumed=assumed),
-        v.pair(truth=truth, time_to_go=to_go),
+        v.pair(refined),
+        v.pair({"uncertainty": uncertainty, "assumed": v.map("Assumed flow", e.ASSUMED, old)}),
+        v.pair({"truth": v.map("True flow", e.TRUE, old), "time to go": to_go}),
     )
     return v.layout(camera, maps, _plots(v))
 
@@ -258,25 +226,25 @@ def _double(v: _Views) -> Shown:
 def _plots(v: _Views) -> tuple[Part, ...]:
     """Three pages of plots: all of a page are seen at once, and no title is cut."""
     single = len(v.prefixes) == 1
-    flow = (
-        [v.plot("Flow at the robot (µm/s)", e.FLOW_SPEED)]
-        if single
-        else [v.plot(f"Flow, {prefix} (µm/s)", e.FLOW_SPEED, prefixes=(prefix,)) for prefix in v.prefixes]
-    )
-    nis = (e.NIS, e.NIS_MEAN) if "health" in v.present and single else (e.NIS,)
+    flow = [
+        v.plot("Flow at the robot (µm/s)" if single else f"Flow, {prefix} (µm/s)", e.FLOW_SPEED, prefixes=(prefix,))
+        for prefix in v.prefixes
+    ]
+    nis = (e.NIS, e.NIS_MEAN) if e.PULSATION in v.present and single else (e.NIS,)
     frequency = v.plot("Field (Hz)", e.FREQUENCY)
+    extra = sorted(name for name in v.present if name.startswith(f"{e.EXTRA}/"))
     return (
         _row(
             "Robot",
             *flow,
-            v.plot("Tracking error (µm)", e.TRACKING_ERROR, needs="tracking"),
+            v.plot("Tracking error (µm)", e.TRACKING_ERROR),
             frequency if single else None,
         ),
         _row(
             "Observer",
-            v.plot("Estimate error (µm)", e.ESTIMATE_ERROR, needs="true robot"),
+            v.plot("Estimate error (µm)", e.ESTIMATE_ERROR),
             v.plot("Observer NIS", *nis),
-            v.plot("Pulsation (%)", e.PULSATION, needs="health"),
+            v.plot("Pulsation (%)", e.PULSATION),
         ),
         _row("Components", v.plot("Flow at the robot by components (µm/s)", e.FLOW_COMPONENTS) if single else None),
         _row(
@@ -285,25 +253,54 @@ def _plots(v: _Views) -> tuple[Part, ...]:
             v.plot("Heading (°)", e.HEADING),
             v.plot("Field (mT)", e.AMPLITUDE),
         ),
-        _row("Timing", v.plot("Timing (ms)", e.TIMING, needs="timing")),
-        _row("Other topics", *(v.plot(entity.removeprefix(e.EXTRA), entity) for entity in v.extra)),
+        _row("Timing", v.plot("Timing (ms)", e.TIMING)),
+        _row("Other topics", *(v.plot(entity.removeprefix(e.EXTRA), entity) for entity in extra[:_MOST_EXTRA])),
     )
 
 
-def _existing(parts: Iterable[Part]) -> list[Shown]:
+def layout_of(body: Shown, **time: Any) -> rrb.Blueprint:
+    """A layout of these views alone; `time`: timeline, and whether it plays."""
+    return rrb.Blueprint(
+        body,
+        rrb.TimePanel(state="collapsed", **time),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def events_view(paths: Iterable[str], timeline_columns: Sequence[TimelineColumn] = ()) -> rrb.TextLogView:
+    """The events of some entities as a log."""
+    columns = rrb.TextLogColumns(timeline_columns=timeline_columns, text_log_columns=["Body"])
+    return rrb.TextLogView(name="Events", origin="/", contents=_contents(paths), columns=columns)
+
+
+def legend_of(*, visible: bool) -> rrb.PlotLegend:
+    """The legend of a plot, in its upper right corner."""
+    return rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=visible)
+
+
+def existing(parts: Iterable[Part]) -> list[Shown]:
+    """The parts that are there."""
     return [part for part in parts if part is not None]
+
+
+def tabs(*parts: Part) -> Part:
+    """Views one behind the other, the first in front; None without any."""
+    found = existing(parts)
+    return rrb.Tabs(*found, active_tab=0) if found else None
 
 
 def _row(name: str, *parts: Part) -> Part:
     """Views side by side."""
-    existing = _existing(parts)
-    return rrb.Horizontal(*existing, name=name) if existing else None
+    found = existing(parts)
+    return rrb.Horizontal(*found, name=name) if found else None
 
 
-def _tabs(*parts: Part) -> Part:
-    """Views one behind the other, the first in front."""
-    existing = _existing(parts)
-    return rrb.Tabs(*existing, active_tab=0) if existing else None
+def _contents(paths: Iterable[str]) -> list[str]:
+    """The contents of a view that shows these entities."""
+    return [f"+ {path}" for path in paths]
 
 
 def _bounds(box: Box) -> rrb.VisualBounds2D:

@@ -58,11 +58,6 @@ class ColourScale:
     high: float
     step: float  # between ticks
 
-    @property
-    def unit(self) -> str:
-        """Unit of the values."""
-        return "s" if self.table == "time" else "µm/s"
-
     @classmethod
     def up_to(cls, largest: float, table: Table) -> ColourScale:
         """From zero (a change: from its negative) to a round number that is not below `largest`."""
@@ -76,6 +71,12 @@ class ColourScale:
         """The multiples of the step from low to high."""
         first, last = (math.floor(abs(end) / self.step + 1e-9) for end in (self.low, self.high))
         return [self.step * i for i in range(-first, last + 1)]
+
+    @property
+    def labels(self) -> list[str]:
+        """The ticks as text; of a change with their sign."""
+        sign = "+" if self.table == "change" else ""
+        return [f"{tick:{sign}g}" if abs(tick) > 1e-9 * self.high else "0" for tick in self.ticks]
 
     def paint(self, values: ArrayLike) -> NDArray[np.uint8]:
         """Colours (..., 3) of values (...); NaN becomes the colour of solid."""

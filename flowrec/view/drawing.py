@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import functools
+import math
+from collections import deque
 from collections.abc import Iterable
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowrec.core import NS_PER_S
 from flowrec.view.colours import SOLID, Rgb
 
 Picture = NDArray[np.uint8]
 Points = NDArray[np.float64]
 SUBPIXEL_BITS = 4  # coordinates of OpenCV's lines are given in 1/16 px
 _RIM = 0.75  # opacity of the rim
+_TRAIL_S = 4.0
 _FAR_PX = 1e5  # beyond it nothing is drawn
 _HEAD = 0.45  # length of an arrow's head over that of the arrow
 _HEAD_PX = (2.5, 6.0)  # least and largest, in widths of its line
@@ -22,8 +27,25 @@ CIRCLE: Points = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
 CROSS: tuple[Points, Points] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
+class Trail:
+    """The way of the last seconds, by points that are at least `step_px` apart."""
+
+    def __init__(self, step_px: float) -> None:
+        self._step_px = step_px
+        self._points: deque[tuple[int, Points]] = deque()
+
+    def add(self, stamp_ns: int, point: Points) -> list[Points]:
+        """The points of the trail after another one (2,)."""
+        kept = self._points
+        if not kept or math.dist(kept[-1][1], point) >= self._step_px:
+            kept.append((stamp_ns, point))
+        while kept and stamp_ns - kept[0][0] > _TRAIL_S * NS_PER_S:
+            kept.popleft()
+        return [each for _, each in kept]
+
+
 class Layer:
-    """Lines that stay for many images. Each pixel becomes a x grey level + b.
+    """Lines that stay for many images, as colours with opacities.
 
     Parameters
     ----------
@@ -31,69 +53,66 @@ class Layer:
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        self._kept = np.ones(shape, np.float32)
-        self._added = np.zeros((*shape, 3), np.float32)
-        self._where = np.zeros(0, np.intp)
-        self._factor, self._offset = np.zeros((0, 1), np.float32), np.zeros((0, 3), np.float32)
+        self._ink = np.zeros((*shape, 4), np.float32)  # BGR times opacity, and opacity
 
-    def lines(self, lines: Iterable[Points], colour: Rgb, width_px: float) -> None:
-        """Polylines, each (n, 2) as x, y."""
+    def lines(self, lines: Iterable[Points], heads: Iterable[Points], colour: Rgb, width_px: float) -> None:
+        """Polylines, each (n, 2) as x, y, and polygons that are filled."""
         polylines = [to_fixed_point(each) for each in lines if drawable(each)]
-        for shade, width, opacity in ((SOLID, width_px + 2.0, _RIM), (colour, width_px, 1.0)):
-            mask = np.zeros(self._kept.shape, np.uint8)
-            cv2.polylines(mask, polylines, False, 255, max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
-            self._mix(mask, shade, opacity)
-
-    def arrows(self, begins: Points, ends: Points, colour: Rgb, width_px: float) -> None:
-        """Arrows from `begins` to `ends`, both (n, 2)."""
-        polylines, heads = [], []
-        for begin, end in zip(begins, ends, strict=True):
-            length = float(np.hypot(*(end - begin)))
-            if not drawable(np.array([begin, end])) or length <= 0.0:
-                continue
-            along = (end - begin) / length
-            head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
-            across = 0.45 * head * np.array([-along[1], along[0]])
-            base = end - head * along
-            polylines.append(to_fixed_point(np.array([begin, base])))
-            heads.append(to_fixed_point(np.array([end, base + across, base - across])))
+        polygons = [to_fixed_point(each) for each in heads]
         for shade, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
-            mask = np.zeros(self._kept.shape, np.uint8)
-            cv2.polylines(mask, polylines, False, 255, max(round(width_px + rim), 1), cv2.LINE_AA, SUBPIXEL_BITS)
-            for each in heads:
+            mask = np.zeros(self._ink.shape[:2], np.uint8)
+            width = max(round(width_px + rim), 1)
+            cv2.polylines(mask, polylines, False, 255, width, cv2.LINE_AA, SUBPIXEL_BITS)
+            for each in polygons:
                 cv2.fillPoly(mask, [each], 255, cv2.LINE_AA, SUBPIXEL_BITS)
             if rim:
-                cv2.polylines(mask, heads, True, 255, round(rim), cv2.LINE_AA, SUBPIXEL_BITS)
+                cv2.polylines(mask, polygons, True, 255, round(rim), cv2.LINE_AA, SUBPIXEL_BITS)
             self._mix(mask, shade, opacity)
 
-    def finish(self) -> None:
-        """End the drawing; only then the layer can be mixed with images."""
-        self._where = np.flatnonzero(self._kept < 1.0)
-        self._factor = self._kept.reshape(-1, 1)[self._where]
-        self._offset = self._added.reshape(-1, 3)[self._where] + 0.5
-
     def blend(self, grey: NDArray[np.uint8], picture: Picture) -> None:
-        """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it."""
-        levels = grey.reshape(-1)[self._where]
-        mixed = (levels[:, None] * self._factor + self._offset).astype(np.uint8)
-        picture.reshape(-1, 3)[self._where] = mixed
+        """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it; nothing is drawn after it."""
+        where, ink = self._finished
+        levels = grey.reshape(-1, 1)[where]
+        picture.reshape(-1, 3)[where] = (levels * (1.0 - ink[:, 3:]) + ink[:, :3] + 0.5).astype(np.uint8)
+
+    @functools.cached_property
+    def _finished(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Places of the pixels that have lines, and their ink."""
+        where = np.flatnonzero(self._ink[..., 3])
+        return where, self._ink.reshape(-1, 4)[where]
 
     def _mix(self, mask: NDArray[np.uint8], colour: Rgb, opacity: float) -> None:
         inked = np.flatnonzero(mask)  # a few percent of the pixels
         alpha = mask.reshape(-1)[inked, None] * np.float32(opacity / 255.0)
-        kept, added = self._kept.reshape(-1, 1), self._added.reshape(-1, 3)
-        kept[inked] *= 1.0 - alpha
-        added[inked] = added[inked] * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32)
+        ink = self._ink.reshape(-1, 4)
+        ink[inked] = ink[inked] * (1.0 - alpha) + alpha * np.array([*bgr(colour), 1.0], np.float32)
 
 
-def draw_outlines(picture: Picture, polylines: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
-    """Polylines, as `fixed` returns them, that are drawn for one image only."""
-    for shade, width in ((SOLID, width_px + 1.0), (colour, width_px)):
-        cv2.polylines(picture, polylines, False, bgr(shade), max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+def arrows(begins: Points, ends: Points, width_px: float) -> tuple[list[Points], list[Points]]:
+    """Shafts and heads, for `Layer.lines`, of arrows from `begins` to `ends`, both (n, 2)."""
+    shafts, heads = [], []
+    for begin, end in zip(begins, ends, strict=True):
+        length = float(np.hypot(*(end - begin)))
+        if not drawable(np.array([begin, end])) or length <= 0.0:
+            continue
+        along = (end - begin) / length
+        head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
+        across = 0.45 * head * np.array([-along[1], along[0]])
+        base = end - head * along
+        shafts.append(np.array([begin, base]))
+        heads.append(np.array([end, base + across, base - across]))
+    return shafts, heads
+
+
+def draw_outline(picture: Picture, line: Points, colour: Rgb, width_px: float) -> None:
+    """A polyline (n, 2) that is drawn for one image only."""
+    for shade, rim in ((SOLID, 1.0), (colour, 0.0)):
+        width = max(round(width_px + rim), 1)
+        cv2.polylines(picture, [to_fixed_point(line)], False, bgr(shade), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
-    """Put letters (see text_masks.py) on a picture of one colour; returns their width in px."""
+    """Put letters, a mask of grey levels (h, w), on a picture of one colour; returns their width in px."""
     rows, columns = max(picture.shape[0] - top, 0), max(picture.shape[1] - left, 0)
     mask = mask[:rows, :columns]
     part = picture[top : top + mask.shape[0], left : left + mask.shape[1]]
@@ -104,14 +123,10 @@ def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, co
 
 def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) -> None:
     """Put the pixels of `clean` back within a circle."""
-    x, y = centre.tolist()
-    x0, y0 = max(int(x - radius_px), 0), max(int(y - radius_px), 0)
-    x1, y1 = min(int(x + radius_px) + 2, picture.shape[1]), min(int(y + radius_px) + 2, picture.shape[0])
-    if x0 >= x1 or y0 >= y1:
-        return
-    rows, columns = np.ogrid[y0:y1, x0:x1]
-    inside = (columns - x) ** 2 + (rows - y) ** 2 <= radius_px**2
-    picture[y0:y1, x0:x1][inside] = clean[y0:y1, x0:x1][inside]
+    mask = np.zeros(picture.shape[:2], np.uint8)
+    x, y, radius = np.rint(np.array([*centre, radius_px]) * (1 << SUBPIXEL_BITS)).astype(int).tolist()
+    cv2.circle(mask, (x, y), radius, 255, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
+    cv2.copyTo(clean, mask, picture)
 
 
 def to_fixed_point(points: Points) -> NDArray[np.int32]:

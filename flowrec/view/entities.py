@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,12 +33,17 @@ REFINED = "flow/refined/speed"
 TRUE = "flow/truth/speed"
 CHANGE = "flow/change/map"
 UNCERTAINTY = "flow/uncertainty/map"
-NOT_YET = "not yet"  # beside a map that comes later in the session
-SPEED_SCALE = "flow/speed scale"  # colour bar and ticks, common to all maps of speed
-CHANGE_SCALE = "flow/change/scale"
-UNCERTAINTY_SCALE = "flow/uncertainty/scale"
 TIME_TO_GO = "plan/time to go/map"
-TIME_TO_GO_SCALE = "plan/time to go/scale"
+SPEED_SCALE = "flow/speed scale"
+SCALES = {  # of each map: the colour bar and its ticks; one is common to all maps of speed
+    ASSUMED: SPEED_SCALE,
+    REFINED: SPEED_SCALE,
+    TRUE: SPEED_SCALE,
+    CHANGE: "flow/change/scale",
+    UNCERTAINTY: "flow/uncertainty/scale",
+    TIME_TO_GO: "plan/time to go/scale",
+}
+NOT_YET = "not yet"  # beside a map that comes later in the session
 
 AMPLITUDE = "coils/amplitude"
 FREQUENCY = "coils/frequency"
@@ -59,6 +65,8 @@ SIGHT = "Robot"
 LANES = (PHASE, ALARM, MARKS, LOSSES, SIGHT)
 LANES_OF_RUN = (MARKS, LOSSES, SIGHT)  # the same in a replay
 EXTRA = "extra"  # before the path of an extra topic and the field of its message
+# A session may lack these: a layout shows those that were logged.
+OPTIONAL = frozenset({*SCALES, *LANES, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING})
 SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"
@@ -76,13 +84,7 @@ class Style:
     width: float  # of the path; the first session's is wide and below: both are visible where they coincide
     second: bool = False
 
-    @property
-    def line_points(self) -> float:
-        """Width of a line in a plot."""
-        return 1.5 if self.width < _WIDE else self.width
 
-
-_WIDE = 3.0
 _STYLES = {
     "": Style("", colours.CYAN, colours.ORANGE, 1.4),
     "recorded": Style("recorded ", colours.ORANGE, colours.ORANGE, 3.2),
@@ -95,26 +97,35 @@ _STYLES = {
 REPLAY, PAIR = ("recorded", "replayed"), ("A", "B")  # prefixes of two sessions in one view
 
 
+@functools.cache
 def entity_path(prefix: str, entity: str) -> str:
     """The entity's full path, escaped for Rerun; `prefix` is '' or one of REPLAY or PAIR."""
     return new_entity_path([part for part in (prefix, *entity.split("/")) if part])
 
 
 class EntityLogger:
-    """Logs the entities of one session below `prefix`: '', or one of REPLAY or PAIR."""
+    """Logs the entities of one session below `prefix`: '', or one of REPLAY or PAIR.
+
+    Attributes
+    ----------
+    present : the OPTIONAL entities, and those of extra topics, that were ever logged.
+    """
 
     def __init__(self, stream: rr.RecordingStream, prefix: str) -> None:
         self.stream = stream
         self.prefix = prefix
         self.style = _STYLES[prefix]
-        self._paths: dict[str, str] = {}
+        self.present: set[str] = set()
 
     def log(self, entity: str, *components: rr.AsComponents, static: bool = False) -> None:
         """Log the components of an entity at the present time, or (static) for all times."""
-        path = self._paths.get(entity)
-        if path is None:
-            path = self._paths[entity] = entity_path(self.prefix, entity)
-        self.stream.log(path, components[0], *components[1:], static=static)
+        self.stream.log(entity_path(self.prefix, entity), components[0], *components[1:], static=static)
+        if not static and (entity in OPTIONAL or entity.startswith(EXTRA)) and not isinstance(components[0], rr.Clear):
+            self.present.add(entity)
+
+    def clear(self, entity: str) -> None:
+        """Show nothing of an entity from the present time on."""
+        self.log(entity, rr.Clear(recursive=False))
 
     def log_styles(self) -> None:
         """Log what never changes of moving entities, so that each tick logs only their positions."""
@@ -164,12 +175,11 @@ class EntityLogger:
                 "total (ms)": colours.WHITE,
             },
         }
+        width = max(self.style.width, 1.5)
         for entity, named in lines.items():
             single = bool(self.prefix) and len(named) == 1
             names = [self.prefix] if single else list(named)
-            series = rr.SeriesLines(
-                names=names, colors=list(named.values()), widths=[self.style.line_points] * len(named)
-            )
+            series = rr.SeriesLines(names=names, colors=list(named.values()), widths=[width] * len(named))
             self.log(entity, series, static=True)
 
 

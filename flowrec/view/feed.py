@@ -10,18 +10,20 @@ from __future__ import annotations
 import contextlib
 import pickle
 import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from flowrec.core import Frame, Tick, start_child
+from flowrec.view.viewer import leave
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
@@ -193,14 +195,66 @@ class Feed:
         step = 1
         while self._queue:
             tick = self._queue.popleft()
-            new = {name: getattr(tick, name) for name in self._shown if getattr(tick, name) is not getattr(sent, name)}
-            changes.append({"stamp_ns": tick.stamp_ns, **new})
+            changes.append({"stamp_ns": tick.stamp_ns, **tick.news(sent, self._shown)})
             sent = tick
         frame = self._frame
         if changes and frame is not None and sent.frame is not None and frame.index == sent.frame.index:
             step = max(1, -(-max(frame.image.shape) // _PREVIEW_PX))
             changes[-1]["frame"] = replace(frame, image=frame.image[::step, ::step])
         return Batch(step, changes, self._remarks()), sent
+
+
+class FeedSink:
+    """A sink that hands ticks to a process, if that has started.
+
+    Whatever happens to the process, `write` neither waits nor raises.
+    """
+
+    def __init__(self) -> None:
+        self._feed: Feed | None = None
+        self._missed = 0
+
+    @property
+    def pid(self) -> int | None:
+        """The process; None if it did not start."""
+        return None if self._feed is None else self._feed.process.pid
+
+    @property
+    def dropped(self) -> int:
+        """Ticks that were not shown, because the process could not keep up, has ended, or is not there."""
+        return self._missed + (0 if self._feed is None else self._feed.dropped)
+
+    def write(self, tick: Tick) -> None:
+        """Take one tick; a few microseconds."""
+        if self._feed is None:
+            self._missed += 1
+        else:
+            self._feed.write(tick)
+
+    def _end(self, timeout_s: float, stays: str, last: object = None) -> bool:
+        """Close the feed, once; whether its process stays, as `Feed.close` says."""
+        feed = self._feed
+        if feed is None or feed.closing or not feed.close(timeout_s, stays, last):
+            return False
+        leave(feed.process)
+        return True
+
+    def close(self) -> None:
+        """End the process within a time limit."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def read_feed() -> Iterator[Any]:
+    """In the process: what it is sent at stdin, until the run has ended, or was killed while it wrote."""
+    with contextlib.suppress(EOFError, pickle.UnpicklingError):
+        while True:
+            yield pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
 
 
 def _send(pipe: Any, what: object) -> None:

@@ -96,10 +96,7 @@ def _chip(centre_m: tuple[float, float], size_m: float) -> Panel:
 def _plot(plot: Plot) -> Panel:
     paths = [
         {
-            "value": f"{plot.topic}.{field}",
-            "label": label,
-            "enabled": True,
-            "timestampMethod": "receiveTime",
+            **_path(plot.topic, field, label),
             "color": colour,
             "showLine": not plot.points,
             "lineSize": 2.5 if plot.points else 1.5,
@@ -129,11 +126,12 @@ def _along_route() -> Panel:
 
 
 def _states() -> Panel:
-    paths = [
-        {"value": f"{topic}.{field}", "label": label, "enabled": True, "timestampMethod": "receiveTime"}
-        for topic, (field, label) in STATES.items()
-    ]
-    return {"paths": paths, "isSynced": True}
+    return {"paths": [_path(topic, *state) for topic, state in STATES.items()], "isSynced": True}
+
+
+def _path(topic: str, field: str, label: str) -> Panel:
+    """A field of a topic as it is at each time that a message was received."""
+    return {"value": f"{topic}.{field}", "label": label, "enabled": True, "timestampMethod": "receiveTime"}
 
 
 def _tab(panels: dict[str, str]) -> Panel:

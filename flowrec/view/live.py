@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from typing import Literal, Self
+from typing import Literal
 
-from flowrec.core import Tick
 from flowrec.view import live_server, viewer
-from flowrec.view.feed import Feed
+from flowrec.view.feed import Feed, FeedSink
 from flowrec.view.scene import Scene
 
 Mode = Literal["spawn", "serve"]
@@ -15,31 +14,28 @@ Mode = Literal["spawn", "serve"]
 _START_S = 30.0  # for the server to accept viewers: importing Rerun takes a second, on a busy machine more
 _CLOSE_S = 10.0  # for the last ticks to be shown; then the process hangs
 _POLL_S = 0.02
+_MAX_HZ = 20.0
 _WITHOUT = "the run goes on without"
 
 
-class LiveView:
-    """A sink that shows the run in Rerun: `spawn` opens a window, `serve` waits for viewers on this machine.
+class LiveView(FeedSink):
+    """A sink that shows the run in Rerun: `spawn` opens a window, `serve` waits for viewers on this machine."""
 
-    Whatever happens to the viewer, `write` neither waits nor raises.
-    """
-
-    def __init__(self, scene: Scene, mode: Mode = "spawn", port: int | None = None, max_hz: float = 20.0) -> None:
+    def __init__(self, scene: Scene, mode: Mode = "spawn", port: int | None = None) -> None:
+        super().__init__()
         self.port = viewer.free_port() if port is None else port
         self.afterwards = ""  # one line for the operator about a server that stays after `close`; '' if it does not
-        self._feed: Feed | None = None
-        self._missed = 0
-        self._message = self._start(scene, mode, max_hz)
+        self._message = self._start(scene, mode)
         self._wait_until_it_accepts()
 
-    def _start(self, scene: Scene, mode: Mode, max_hz: float) -> str:
+    def _start(self, scene: Scene, mode: Mode) -> str:
         """Start the process; the message for the operator."""
         if viewer.executable() is None:
             return f"no live view: Rerun's viewer is not installed (pip install rerun-sdk); {_WITHOUT}"
         window = mode == "spawn" and viewer.has_display()
         command = (live_server.__name__, str(self.port), "window" if window else "serve")
         try:
-            self._feed = Feed(command, scene, max_hz)
+            self._feed = Feed(command, scene, _MAX_HZ)
         except OSError as error:
             return f"no live view: its process does not start ({error.strerror or error}); {_WITHOUT}"
         how = f"rerun --connect {self.url}"
@@ -61,32 +57,13 @@ class LiveView:
         """Address for a viewer on this machine."""
         return viewer.url(self.port)
 
-    @property
-    def pid(self) -> int | None:
-        """The process that owns Rerun."""
-        return None if self._feed is None else self._feed.process.pid
-
-    @property
-    def dropped(self) -> int:
-        """Ticks that were not shown, because the view could not keep up, has ended, or is not there."""
-        return self._missed + (0 if self._feed is None else self._feed.dropped)
-
-    def write(self, tick: Tick) -> None:
-        """Take one tick; a few microseconds."""
-        if self._feed is None:
-            self._missed += 1
-        else:
-            self._feed.write(tick)
-
     def close(self, timeout_s: float = _CLOSE_S) -> None:
         """Show the last ticks within a time limit, then end the process. It stays for viewers that are connected."""
-        feed = self._feed
-        if feed is not None and not feed.closing and feed.close(timeout_s, live_server.STAYS):
+        if self._end(timeout_s, live_server.STAYS):
             self.afterwards = (
-                f"live view: its server (process {feed.process.pid}) stays for the viewers that are connected, and "
+                f"live view: its server (process {self.pid}) stays for the viewers that are connected, and "
                 f"ends {live_server.ABSENT_S:g} s after the last of them"
             )
-            viewer.leave(feed.process)
 
     def _wait_until_it_accepts(self) -> None:
         """Wait for the server, so that its address is said when viewers can connect; end it if it takes too long."""
@@ -97,9 +74,3 @@ class LiveView:
                 self._message = f"no live view: its server did not start within {_START_S:g} s; {_WITHOUT}"
                 return
             time.sleep(_POLL_S)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()

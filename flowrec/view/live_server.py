@@ -7,7 +7,6 @@ the process stays after the run while a viewer is connected.
 
 from __future__ import annotations
 
-import pickle
 import socket
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from dataclasses import replace
 
 from flowrec.core import Tick, seconds
 from flowrec.view import viewer
-from flowrec.view.feed import Batch
+from flowrec.view.feed import Batch, read_feed
 from flowrec.view.scene import Scene
 
 ACCEPTS = "flowrec: accepts viewers"  # what the process says to the run
@@ -40,11 +39,10 @@ def serve() -> None:
     from flowrec.view.summary_text import LiveSummary
 
     port, window = int(sys.argv[1]), sys.argv[2] == "window"
-    source = sys.stdin.buffer
-    scene: Scene = pickle.load(source)  # noqa: S301 - from our own parent
+    source = read_feed()
+    scene: Scene = next(source)
     stream = open_stream(scene)
     present: AbstractSet[str] = frozenset({SUMMARY})
-    batch: Batch
     with socket.socket() as trial:  # Rerun reports a taken port only in its log
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -61,27 +59,24 @@ def serve() -> None:
     describe(stream, scene)
     opened = viewer.open_window("--connect", viewer.url(port)) if window else None
     logger, summary = TickLogger(stream, scene), LiveSummary(scene)
-    tick, phases = Tick(), 0
-    while True:
-        try:
-            batch = pickle.load(source)  # noqa: S301
-        except (EOFError, pickle.UnpicklingError):  # the run ended, or was killed while it wrote
-            break
+    tick, begun = Tick(), 0
+    batch: Batch
+    for batch in source:
         logger.image_step = batch.step
         news = False
         for changes in batch.changes:
             tick = replace(tick, **changes)
             news |= summary.add(tick)
-            logger.doubtful = summary.doubtful
+            logger.states.doubtful = summary.doubtful
             logger.log(tick)
         if news:
             stream.log(SUMMARY, summary.document(), static=True)
-        begun = len(logger.phases)
+        phases = logger.states.phases
         ended = tick.mission is not None and tick.mission.finished
-        if not logger.present <= present or (begun > phases and not ended):
+        if not logger.present <= present or (len(phases) > begun and not ended):
             # What is shown for the first time is added to the layout. At the end it stays as a person has arranged it.
-            present, phases = present | logger.present, begun
-            stream.send_blueprint(blueprint(scene, ("",), present, seconds(tick.stamp_ns), [logger.phases], live=True))
+            present, begun = present | logger.present, len(phases)
+            stream.send_blueprint(blueprint(scene, ("",), present, seconds(tick.stamp_ns), [phases], live=True))
     stream.log(SUMMARY, summary.document(), static=True)
     _stay(port, opened)
     stream.disconnect()

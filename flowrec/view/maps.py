@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from flowrec.core import Matrix
 from flowrec.view import colours
 from flowrec.view.colours import ColourScale
 from flowrec.view.entities import points
-from flowrec.view.scene import Placement, Scene
+from flowrec.view.scene import Scene
 
 _BAR_ROWS = 256
 _BAR_SHARE = 0.74  # of the height of the channels: words need room above and below
 _LEAST_BAR = 0.3  # height of a colour bar over the width of the channels
 
 
-@dataclass(slots=True)
 class SpeedScale:
     """The scale of all maps of speed, also of a recorded and a replayed session in one view."""
 
-    scale: ColourScale | None = None
-    version: int = 0  # incremented when maps must be painted again
+    scale: ColourScale | None = None  # another one when maps must be painted again
 
     def include(self, peak_um_s: float) -> None:
         """Extend the scale to a speed."""
         if self.scale is None or peak_um_s > self.scale.high:
             self.scale = ColourScale.up_to(peak_um_s, "speed")
-            self.version += 1
 
 
 def wave_fronts(time_s: NDArray[np.float32], mask: NDArray[np.bool_], scale: ColourScale) -> rr.EncodedImage:
@@ -53,36 +49,31 @@ def encode_png(pixels: NDArray[np.uint8]) -> rr.EncodedImage:
     return rr.EncodedImage(contents=png.tobytes(), media_type="image/png")
 
 
-def transform_of(placement: Placement) -> rr.Transform3D:
-    """The transform of an image into the picture plane."""
-    matrix = np.diag([placement.scale, placement.scale, 1.0])
-    matrix[:2, :2] = placement.scale * placement.axes
-    return rr.Transform3D(translation=[*placement.offset, 0.0], mat3x3=matrix)
+def transform_of(matrix: Matrix) -> rr.Transform3D:
+    """The transform of an image into the picture plane: `matrix` (2, 3) says where a point (x, y, 1) of it lies."""
+    turned = np.eye(3)
+    turned[:2, :2] = matrix[:, :2]
+    return rr.Transform3D(translation=[*matrix[:, 2], 0.0], mat3x3=turned)
 
 
-@dataclass(frozen=True, slots=True)
 class ColourBar:
-    """Position of the colour bar beside a map, in the picture plane."""
+    """Position of the colour bar beside a map, in the picture plane.
 
-    left: float
-    top: float
-    width: float
-    height: float
+    It is to the right of the channels, a little lower; of a very flat chip not shorter than a third of its width.
 
-    @classmethod
-    def beside(cls, scene: Scene) -> ColourBar:
-        """To the right of the channels, a little lower; of a very flat chip not shorter than a third of its width."""
+    Attributes
+    ----------
+    bounds : left, top, right, bottom of the channels together with the bar and its numbers.
+    """
+
+    def __init__(self, scene: Scene) -> None:
         left, top, right, bottom = scene.fluid_bounds()
         size = max(bottom - top, _LEAST_BAR * (right - left))
         top = 0.5 * (top + bottom) - 0.5 * size
-        return cls(right + 0.06 * size, top + 0.16 * size, 0.05 * size, _BAR_SHARE * size)
-
-    def bounds_with(self, scene: Scene) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom of the channels together with the bar and its numbers."""
-        left, _, _, _ = scene.fluid_bounds()
-        size = self.height / _BAR_SHARE
-        top = self.top - 0.16 * size
-        return left - 0.03 * size, top - 0.02 * size, self.left + self.width + 0.34 * size, top + 1.02 * size
+        self.left, self.top = right + 0.06 * size, top + 0.16 * size
+        self.width, self.height = 0.05 * size, _BAR_SHARE * size
+        right = self.left + self.width
+        self.bounds = left - 0.03 * size, top - 0.02 * size, right + 0.34 * size, top + 1.02 * size
 
     def strip(self, scale: ColourScale) -> tuple[rr.Image, rr.Transform3D]:
         """The colours, the highest value on top."""
@@ -99,9 +90,7 @@ class ColourBar:
         marks = rr.LineStrips2D(
             [[[right, at], [right + dash, at]] for at in y], colors=colours.WHITE, radii=points(0.8)
         )
-        sign = "+" if scale.table == "change" else ""
-        labels = [f"{value:{sign}g}" if abs(value) > 1e-9 * scale.high else "0" for value in scale.ticks]
-        labels.append(scale.unit)
+        labels = [*scale.labels, "s" if scale.table == "time" else "µm/s"]
         # Rerun centres a label below its point: a little up and half a label to the right puts it beside its tick.
         positions = [(right + 3.2 * self.width, row - 0.045 * self.height) for row in y]
         positions.append((self.left + 0.5 * self.width, self.top - 0.2 * self.height))

@@ -8,16 +8,15 @@ drawn where the image shows it.
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Estimate, FlowField, Mission, Tick, shift_px
+from flowrec.core import Estimate, FlowField, Mission, Tick, shift_px
 from flowrec.view import colours
 from flowrec.view.colours import round_below
-from flowrec.view.drawing import CIRCLE, Layer, Picture, Points, draw_outlines, drawable, restore, to_fixed_point
+from flowrec.view.drawing import CIRCLE, Layer, Picture, Points, Trail, arrows, draw_outline, drawable, restore
 from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.scene import Scene
 from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, StatusBar
@@ -27,7 +26,6 @@ _NOMINAL_PX = 640.0  # width of the picture that the sizes below are meant for
 _LETTER_PX = 13.0
 _LINE_PX = 1.6
 _SPARSER = 1.9  # distance of the arrows over that of the viewer's map, which is larger
-_TRAIL_S = 4.0
 _TRAIL_STEP_PX = 3.0
 _RING_PX = 3.0  # between the robot and its ring
 _LONGEST = 0.9  # arrow, in spacings of the arrows
@@ -59,18 +57,17 @@ class Overlay:
         self._robot_px = self.zoom * scene.length_px(scene.robot.radius_um)
         self._grid = _sparser(*arrow_grid(scene))
         self._to_image: NDArray[np.float64] = np.eye(2, 3)  # by the refined registration and the shift
-        self._trail: deque[tuple[int, Points]] = deque()
+        self._trail = Trail(_TRAIL_STEP_PX * self._unit)
         um_per_px = scene.calibration.um_per_px / self.zoom
         self._status_bar = StatusBar((self.size_px[0], self.size_px[1] - self._height), letter, um_per_px)
         self._tick = Tick()
-        self._layer = Layer((0, 0))
-        self._redraw(self._tick)
+        self._layer = self._redraw(self._tick)
 
     def draw(self, image: NDArray[np.uint8], tick: Tick) -> Picture:
         """The picture in BGR of an image (h, w) of 8 bits and its tick; it is valid until the next call."""
         last, self._tick = self._tick, tick
         if _content_key(tick) != _content_key(last):
-            self._redraw(tick)
+            self._layer = self._redraw(tick)
         if self.zoom > 1:
             size = (self._width, self._height)
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -85,10 +82,6 @@ class Overlay:
         self._status_bar.draw(canvas[self._height :], tick.stamp_ns, tick.mission, tick.estimate)
         return canvas
 
-    def _to_px(self, points_um: Points) -> Points:
-        """Measured places (..., 2) in um to pixels of a picture without shift, counted at their centres."""
-        return self.zoom * self._scene.to_plane(points_um) - 0.5
-
     def _chip_to_px(self, points_um: Points) -> Points:
         """Places on the chip to pixels of this picture."""
         return self.zoom * self._image_points(self._scene.to_plane(points_um)) - 0.5
@@ -97,7 +90,7 @@ class Overlay:
         """Image positions of points (..., 2) of the picture plane."""
         return plane @ self._to_image[:, :2].T + self._to_image[:, 2]
 
-    def _redraw(self, tick: Tick) -> None:
+    def _redraw(self, tick: Tick) -> Layer:
         """Draw what does not move: flow, route, goal, and the legend."""
         layer, field, route = Layer((self._height, self._width)), tick.field, tick.route
         registration = None if tick.refined is None else tick.refined.registration
@@ -107,14 +100,13 @@ class Overlay:
         path = self._chip_to_px(route.waypoints_um) if route is not None and route.reachable else np.zeros((0, 2))
         has_route = len(path) > 1 and drawable(path)
         if has_route:
-            layer.lines([path], ROUTE, _LINE_PX * self._unit)
+            layer.lines([path], (), ROUTE, _LINE_PX * self._unit)
         goal = _goal(tick.mission)
         if goal is not None:
             centre, reach = self._chip_to_px(np.array(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
-            layer.lines([centre + reach * part for part in GOAL_SIGN], GOAL, _LINE_PX * self._unit)
-        layer.finish()
-        self._layer = layer
+            layer.lines([centre + reach * part for part in GOAL_SIGN], (), GOAL, _LINE_PX * self._unit)
         self._status_bar.set_legend(goal=goal is not None, route=has_route, flow=flow)
+        return layer
 
     def _draw_flow(self, layer: Layer, field: FlowField, *, refined: bool) -> tuple[str, float, float] | None:
         """Arrows as long as the flow is fast; returns what the legend says of them."""
@@ -128,25 +120,25 @@ class Overlay:
         along = vectors[known] @ self._to_image[:, :2].T
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         half = 0.5 * px_per_speed * np.minimum(speed[known], 1.2 * fastest)[:, None] * along
-        layer.arrows(middle - half, middle + half, FLOW, 0.8 * _LINE_PX * self._unit)
+        width_px = 0.8 * _LINE_PX * self._unit
+        layer.lines(*arrows(middle - half, middle + half, width_px), FLOW, width_px)
         return "refined flow" if refined else "assumed flow", round_below(fastest), px_per_speed
 
     def _draw_robot(self, picture: Picture, clean: Picture, estimate: Estimate) -> None:
-        centre, trail, unit = self._to_px(estimate.position_um), self._trail, self._unit
+        unit = self._unit
+        # Counted at the centres of pixels, of a picture without shift.
+        centre = self.zoom * self._scene.to_plane(estimate.position_um) - 0.5
         if not drawable(centre):
             return
-        if not trail or math.dist(trail[-1][1], centre) >= _TRAIL_STEP_PX * unit:
-            trail.append((estimate.stamp_ns, centre))
-        while trail and estimate.stamp_ns - trail[0][0] > _TRAIL_S * NS_PER_S:
-            trail.popleft()
+        trail = self._trail.add(estimate.stamp_ns, centre)
         colour = ROBOT if estimate.seen else colours.PALE
         off = self.zoom * np.array(shift_px(self._tick.shift))
-        way = np.array([*(point for _, point in trail), centre]) + off
+        way = np.array([*trail, centre]) + off
         centre = centre + off
-        draw_outlines(picture, [to_fixed_point(way)], colour, _LINE_PX * unit)
+        draw_outline(picture, way, colour, _LINE_PX * unit)
         ring = self._robot_px + _RING_PX * unit
         restore(picture, clean, centre, ring)
-        draw_outlines(picture, [to_fixed_point(centre + ring * CIRCLE)], colour, _LINE_PX * unit)
+        draw_outline(picture, centre + ring * CIRCLE, colour, _LINE_PX * unit)
 
 
 def _content_key(tick: Tick) -> tuple[object, ...]:

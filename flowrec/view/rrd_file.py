@@ -6,15 +6,15 @@ import contextlib
 import heapq
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import rerun as rr
 
-from flowrec.core import Output, Tick, seconds
+from flowrec.core import Tick, seconds
 from flowrec.view.blueprint import blueprint
-from flowrec.view.entities import REPLAY, SUMMARY
+from flowrec.view.entities import SUMMARY
 from flowrec.view.logger import TickLogger
 from flowrec.view.maps import SpeedScale
 from flowrec.view.scene import Scene
@@ -28,40 +28,36 @@ _HEAD_BYTES = 1024  # contains the names of application and recording as plain t
 
 
 def write_rrd(
-    output: Output,
+    path: Path,
     scene: Scene,
-    ticks: Iterable[Tick],
-    second_ticks: Iterable[Tick] | None = None,
+    ticks: Mapping[str, Iterable[Tick]],
     progress: Callable[[float], None] | None = None,
-    prefixes: tuple[str, str] = REPLAY,
     summary: rr.TextDocument | None = None,
 ) -> None:
-    """Write ticks, and those of a second session beside them; a file of this name appears when it is complete.
+    """Write the ticks of a session, or of two in one view.
 
     Parameters
     ----------
-    second_ticks : on the same chip, of a replay or of another session.
-    prefixes : of the entities of both.
-    summary : shown beside the pictures.
+    ticks : of each session by its prefix, see entities.py; the second one is on the same chip, of a replay or of
+        another session.
     progress : called from time to time with the session time in s since the first tick.
+    summary : shown beside the pictures.
 
     Raises
     ------
-    SessionError : the file can not be written; OutputError if it may not be.
+    OSError : the file can not be written.
     """
-    with output.new_file() as part:
-        stream = open_stream(scene)
-        try:
-            stream.save(part)
-            if summary is not None:
-                stream.log(SUMMARY, summary, static=True)
-            shown = frozenset({SUMMARY} if summary is not None else ())
-            _log_all(stream, scene, ticks, second_ticks, progress, prefixes, shown)
-            _flush(stream, part)
-        finally:
-            stream.disconnect()
-        if not _is_whole(part):  # Rerun writes in a thread, whose errors it only prints
-            raise OSError("Rerun could not write all of it; is the disk full?")
+    stream = open_stream(scene)
+    try:
+        stream.save(path)
+        if summary is not None:
+            stream.log(SUMMARY, summary, static=True)
+        _log_all(stream, scene, ticks, progress, frozenset() if summary is None else frozenset({SUMMARY}))
+        _flush(stream, path)
+    finally:
+        stream.disconnect()
+    if not _is_whole(path):  # Rerun writes in a thread, whose errors it only prints
+        raise OSError("Rerun could not write all of it; is the disk full?")
 
 
 def _flush(stream: rr.RecordingStream, path: Path) -> None:
@@ -110,43 +106,36 @@ def describe(stream: rr.RecordingStream, scene: Scene) -> None:
 def _log_all(
     stream: rr.RecordingStream,
     scene: Scene,
-    ticks: Iterable[Tick],
-    second_ticks: Iterable[Tick] | None,
+    ticks: Mapping[str, Iterable[Tick]],
     progress: Callable[[float], None] | None,
-    prefixes: tuple[str, str],
-    shown: AbstractSet[str],
+    present: AbstractSet[str],
 ) -> None:
     describe(stream, scene)
-    both = second_ticks is not None
-    speeds = SpeedScale()
-    first = TickLogger(stream, scene, prefixes[0] if both else "", speeds=speeds)
-    second = TickLogger(stream, scene, prefixes[1], images=False, speeds=speeds) if both else None
+    prefixes, speeds = tuple(ticks), SpeedScale()
+    loggers = [TickLogger(stream, scene, prefix, images=prefix == prefixes[0], speeds=speeds) for prefix in prefixes]
     first_ns: int | None = None
     stamp_ns = 0
     index: int | None = None
-    for count, (stamp_ns, again, tick) in enumerate(_merge(ticks, second_ticks or ())):
+    for count, (stamp_ns, number, tick) in enumerate(_merge(ticks.values())):
         first_ns = stamp_ns if first_ns is None else first_ns
-        if again:
-            assert second is not None
-            # Replayed ticks may have no frame, but belong to a recorded one.
-            second.log(tick, frame_index=index)
-        else:
-            index = tick.frame.index if tick.frame is not None else index
-            first.log(tick)
+        if number == 0 and tick.frame is not None:
+            index = tick.frame.index
+        # Replayed ticks may have no frame, but belong to a recorded one.
+        loggers[number].log(tick, frame_index=index)
         if progress is not None and count % _PROGRESS_EVERY == 0:
             progress(seconds(stamp_ns - first_ns))
-    present = first.present | shown
-    if second is not None:
-        present |= {f"{prefixes[1]} {what}" for what in second.present}
-    phases = [first.phases] if second is None else [first.phases, second.phases]
+    present |= loggers[0].present
+    for prefix, logger in zip(prefixes[1:], loggers[1:], strict=True):
+        present |= {f"{prefix} {what}" for what in logger.present}
     # Last, when it is known which views are not empty. Rerun accepts it anywhere in the file.
-    stream.send_blueprint(blueprint(scene, prefixes if both else ("",), present, seconds(stamp_ns), phases))
+    phases = [logger.states.phases for logger in loggers]
+    stream.send_blueprint(blueprint(scene, prefixes, present, seconds(stamp_ns), phases))
 
 
-def _merge(ticks: Iterable[Tick], second: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:
-    """Both in the order of their stamps, the first session's tick before the second's."""
+def _merge(sessions: Iterable[Iterable[Tick]]) -> Iterator[tuple[int, int, Tick]]:
+    """Stamp, number of the session and tick, in the order of stamps; of equal ones the first session's comes first."""
 
-    def label(source: Iterable[Tick], again: bool) -> Iterator[tuple[int, bool, Tick]]:
-        return ((tick.stamp_ns, again, tick) for tick in source)
+    def label(number: int, ticks: Iterable[Tick]) -> Iterator[tuple[int, int, Tick]]:
+        return ((tick.stamp_ns, number, tick) for tick in ticks)
 
-    return heapq.merge(label(ticks, False), label(second, True), key=lambda item: item[:2])
+    return heapq.merge(*(label(*each) for each in enumerate(sessions)), key=lambda item: item[:2])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,16 +16,8 @@ from flowrec.core import Matrix, Shift, shift_px
 from flowrec.physics import Calibration, Chip, Robot, on_chip
 
 _HALF_PX = 0.5
+Box = tuple[float, float, float, float]  # left, top, right, bottom
 _MARGIN = 0.03  # around the channels, of their longer side
-
-
-@dataclass(frozen=True, slots=True)
-class Placement:
-    """Position of an image in the picture plane: offset + scale * axes (column, row), from pixel corners."""
-
-    scale: float
-    offset: tuple[float, float]
-    axes: NDArray[np.float64]  # (2, 2): its columns are the directions of the image's rows and columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,41 +61,44 @@ class Scene:
         """A length in um in the picture plane."""
         return length_um / self.calibration.um_per_px
 
-    def mask_placement(self) -> Placement:
-        """Position of an image on the pixels of the chip's mask."""
-        scale = self.length_px(self.chip.um_per_px)
-        axes = self.calibration.axes
-        first = self.to_plane((0.0, 0.0)) - _HALF_PX * scale * axes.sum(axis=1)  # the corner of the first pixel
-        return Placement(scale, (float(first[0]), float(first[1])), axes)
+    def mask_to_plane(self) -> Matrix:
+        """(2, 3): where a point (x, y, 1) of an image on the pixels of the chip's mask lies; from pixel corners."""
+        scale, axes = self.length_px(self.chip.um_per_px), self.calibration.axes
+        return np.column_stack((scale * axes, self.to_plane((0.0, 0.0)) - _HALF_PX * scale * axes.sum(axis=1)))
 
-    def preview_placement(self, step: int) -> Placement:
-        """Position of a camera image of which only each `step`-th row and column is shown."""
-        return Placement(float(step), (_HALF_PX * (1 - step), _HALF_PX * (1 - step)), np.eye(2))
+    def preview_to_plane(self, step: int) -> Matrix:
+        """(2, 3): the same for a camera image of which only each `step`-th row and column is shown."""
+        return np.column_stack((step * np.eye(2), np.full(2, _HALF_PX * (1 - step))))
 
-    def chip_bounds(self) -> tuple[float, float, float, float]:
+    def outlines(self) -> list[NDArray[np.float64]]:
+        """The walls in the picture plane: closed lines (n, 2) along the border of the mask."""
+        contours, _ = cv2.findContours(self.chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        return [self.to_plane(np.concatenate([c, c[:1]])[:, 0] * self.chip.um_per_px) for c in contours]
+
+    def chip_bounds(self) -> Box:
         """Left, top, right, bottom of the upright box around the chip's mask in the picture plane."""
-        h, w = self.chip.mask.shape
-        corners = (np.array([(0, 0), (w, 0), (0, h), (w, h)]) - _HALF_PX) * self.chip.um_per_px
-        (left, top), (right, bottom) = (edge(self.to_plane(corners), axis=0).tolist() for edge in (np.min, np.max))
+        height, width = self.chip.mask.shape
+        return self._box((0, width), (0, height))
+
+    def fluid_bounds(self) -> Box:
+        """Bounds of the channels of the chip, inside the box of the mask."""
+        columns, rows = (np.flatnonzero(self.chip.mask.any(axis=axis)) for axis in (0, 1))
+        return self._box(columns[[0, -1]] + (0, 1), rows[[0, -1]] + (0, 1)) if rows.size else self.chip_bounds()
+
+    def _box(self, columns: ArrayLike, rows: ArrayLike) -> Box:
+        """The upright box around the pixels of the mask from a column to another, and from a row to another."""
+        corners = (np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2) - _HALF_PX) * self.chip.um_per_px
+        places = self.to_plane(corners)
+        (left, top), (right, bottom) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
         return left, top, right, bottom
 
-    def fluid_bounds(self) -> tuple[float, float, float, float]:
-        """Bounds of the channels of the chip, inside the box of the mask."""
-        rows, columns = (np.flatnonzero(self.chip.mask.any(axis=axis)) for axis in (1, 0))
-        if not rows.size:
-            return self.chip_bounds()
-        (top, bottom), (left, right) = ((line[0] - _HALF_PX, line[-1] + _HALF_PX) for line in (rows, columns))
-        corners = np.array([(left, top), (right, top), (left, bottom), (right, bottom)]) * self.chip.um_per_px
-        (x0, y0), (x1, y1) = (edge(self.to_plane(corners), axis=0).tolist() for edge in (np.min, np.max))
-        return x0, y0, x1, y1
-
-    def shown_bounds(self) -> tuple[float, float, float, float]:
+    def shown_bounds(self) -> Box:
         """The channels with a margin: what a view of the chip or of the camera shows."""
         left, top, right, bottom = self.fluid_bounds()
         margin = _MARGIN * max(right - left, bottom - top)
         return left - margin, top - margin, right + margin, bottom + margin
 
-    def image_bounds(self) -> tuple[float, float, float, float]:
+    def image_bounds(self) -> Box:
         """Left, top, right, bottom of the camera's image in the picture plane."""
         if self.image_px is None:
             return self.chip_bounds()

@@ -6,9 +6,8 @@ import contextlib
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from rerun.experimental import ViewerClient, ViewerState
@@ -17,8 +16,6 @@ from flowrec.core import PICTURE, FlowrecError, Output, nanoseconds
 from flowrec.store import ForeignError, SessionMetadata
 from flowrec.view import viewer
 from flowrec.view.entities import SESSION_TIME
-
-_T = TypeVar("_T")
 
 _LOG_TIME = "message_log_time"  # Rerun's name for the session clock of an .mcap
 _START_S = 20.0
@@ -52,7 +49,7 @@ def screenshot(
         _headless(size) as (client, began),
     ):
         client.open(path.as_uri())
-        state = _until(lambda: _wait_loaded(client), _LOAD_S)
+        state = viewer.until(lambda: _wait_loaded(client), _LOAD_S)
         if state is None:
             raise FlowrecError(f"{path}: the viewer shows nothing of it; `rerun rrd verify {path}` says more")
         ends_ns = {line.name: line.end for recording in state.recordings for line in recording.timelines}
@@ -93,7 +90,7 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple[ViewerClient, float]]:
             raise FlowrecError(f"no screenshot: {error.strerror or error}; `pip install rerun-sdk`") from error
         try:
             began = time.monotonic()
-            client = _until(lambda: _connect(port, process), _START_S)
+            client = viewer.until(lambda: _connect(port, process), _START_S)
             if client is None:
                 raise FlowrecError(f"no screenshot: the viewer does not start; {_why(log)}")
             yield client, began
@@ -121,17 +118,6 @@ def _wait_loaded(client: ViewerClient) -> ViewerState | None:
     """The state of the viewer, once nothing is loading."""
     state = client.get_state()
     return state if not state.loading and any(recording.timelines for recording in state.recordings) else None
-
-
-def _until(done: Callable[[], _T | None], limit_s: float) -> _T | None:
-    """The first result that is not None, within a time limit."""
-    end = time.monotonic() + limit_s
-    while time.monotonic() < end:
-        result = done()
-        if result is not None:
-            return result
-        time.sleep(0.1)
-    return None
 
 
 def _why(log: Path) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun as rr
 
-from flowrec.core import NS_PER_S, Action, Alarm, CameraLosses, Drops, Mission, OperatorEvent, Outcome, Phase
+from flowrec.core import NS_PER_S, Action, Alarm, CameraLosses, Drops, Mission, OperatorEvent, Outcome, Phase, Track
 from flowrec.view import colours
 from flowrec.view import entities as e
 from flowrec.view.colours import Rgb
@@ -29,11 +29,10 @@ _NONE = ""  # a state that is not drawn
 
 
 class StateLogger:
-    """Logs changes of state only; a lane that never had a state is not logged and not in `present`."""
+    """Logs changes of state only; a lane that never had a state is not logged."""
 
-    def __init__(self, entities: EntityLogger, present: set[str], *, doubtful: bool = False) -> None:
+    def __init__(self, entities: EntityLogger, *, doubtful: bool) -> None:
         self._log = entities.log
-        self._present = present
         self.doubtful = doubtful  # the result: its outcome is amber
         self.phases: dict[str, int] = {}  # stamp at which each phase, and the outcome, first began
         self._now: dict[str, str] = {}
@@ -42,21 +41,18 @@ class StateLogger:
 
     def log_mission(self, mission: Mission) -> None:
         """The phase, and at the end the outcome."""
+        name, colour = mission.phase, _PHASE_COLOURS.get(mission.phase, colours.GREY)
         if mission.finished and mission.outcome:
-            done = mission.outcome in set(Outcome) and Outcome(mission.outcome).completes_mission
-            good = colours.YELLOW if self.doubtful else colours.GREEN
-            self._log_phase(mission, mission.outcome, good if done else colours.RED)
-        else:
-            self._log_phase(mission, mission.phase, _PHASE_COLOURS.get(mission.phase, colours.GREY))
-
-    def _log_phase(self, mission: Mission, name: str, colour: Rgb) -> None:
+            name = mission.outcome
+            done = name in set(Outcome) and Outcome(name).completes_mission
+            colour = colours.RED if not done else colours.YELLOW if self.doubtful else colours.GREEN
         if len(self.phases) < _PHASES:
             self.phases.setdefault(name, mission.since_ns)
         self._log_state(e.PHASE, name.capitalize(), colour)
 
-    def log_sight(self, seen: bool) -> None:
+    def log_sight(self, track: Track) -> None:
         """The robot is not seen: nothing is drawn while it is."""
-        self._log_state(e.SIGHT, _NONE if seen else "Not seen", colours.RED)
+        self._log_state(e.SIGHT, _NONE if track.seen else "Not seen", colours.RED)
 
     def log_alarm(self, alarm: str) -> None:
         """Alarms of the observer: words of enums.Alarm, separated by "; "."""
@@ -92,7 +88,6 @@ class StateLogger:
         if state == self._now.get(lane, _NONE):
             return
         self._now[lane] = state
-        self._present.add(lane)
         known = self._colours.setdefault(lane, {})
         if state not in known and len(known) < _STATES:
             known.setdefault(_NONE, colour)

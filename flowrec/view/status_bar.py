@@ -1,23 +1,33 @@
-"""The bar below a picture: clock and state on the left; on the right a legend that ends with the scale bar."""
+"""The bar below a picture: clock and state on the left; on the right a legend that ends with the scale bar.
+
+Texts are masks of grey levels by Pillow's own font. OpenCV's fonts are outlines without a micro sign; Pillow's has none
+either, so it is a u with a descender.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+from PIL import Image as Pillow
+from PIL import ImageDraw, ImageFont
 
 from flowrec.core import Estimate, Mission, printable, seconds
 from flowrec.view import colours
-from flowrec.view.colours import round_below
-from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, bgr, draw_mask
-from flowrec.view.text_masks import clock_mask, text_mask
+from flowrec.view.colours import Rgb, round_below
+from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, Points, arrows, bgr, draw_mask
 
 ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
 _TEXT, _GROUND = colours.WHITE, (24, 24, 28)
 GOAL_SIGN = (*(np.array([0.5 * arm, arm]) for line in CROSS for arm in line), 0.75 * CIRCLE)  # a crosshair, open inside
 _LONGEST_BAR = 0.16  # of the width of the picture
 _MOST_LETTERS = 40  # of words from a file
+_DIGITS = "0123456789"
+_LONGEST_TEXT = 200  # characters
+_MICRO = "µ"
+_STEM, _TAIL = 0.05, 0.15  # width and length of its descender, over the height of letters
 
 
 class StatusBar:
@@ -46,32 +56,27 @@ class StatusBar:
         """
         r, middle = 0.34 * self._letter, 0.5 * self._height
         centre = np.array([1.2 * r, middle])
-        self._parts = [
-            self._part(2.4 * r, "robot", lambda layer: layer.lines([centre + r * CIRCLE], ROBOT, self._line))
-        ]
+        self._parts = [self._part(2.4 * r, "robot", ROBOT, [centre + r * CIRCLE])]
         if goal:
             sign = [centre + 1.2 * r * part for part in GOAL_SIGN]
-            self._parts.append(self._part(2.4 * r, "goal", lambda layer: layer.lines(sign, GOAL, 0.8 * self._line)))
+            self._parts.append(self._part(2.4 * r, "goal", GOAL, sign, width=0.8))
         if route:
             px = 1.4 * self._letter
-            line = [np.array([(0.0, middle), (px, middle)])]
-            self._parts.append(self._part(px, "route", lambda layer: layer.lines(line, ROUTE, self._line)))
+            self._parts.append(self._part(px, "route", ROUTE, [np.array([(0.0, middle), (px, middle)])]))
         if flow is not None:
             words, speed, px_per_speed = flow
             tail, tip = np.array([[1.0, middle]]), np.array([[1.0 + speed * px_per_speed, middle]])
-            text = f"{words} {speed:g} µm/s"
-            self._parts.append(
-                self._part(tip[0, 0], text, lambda layer: layer.arrows(tail, tip, FLOW, 0.8 * self._line))
-            )
+            arrow = arrows(tail, tip, 0.8 * self._line)
+            self._parts.append(self._part(tip[0, 0], f"{words} {speed:g} µm/s", FLOW, *arrow, width=0.8))
         self._parts.append(self._scale_bar())
 
     def draw(self, bar: Picture, stamp_ns: int, mission: Mission | None, estimate: Estimate | None) -> None:
         """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first."""
         bar[:] = bgr(_GROUND)
         left = round(0.6 * self._letter)
-        left += draw_mask(bar, clock_mask(clock_text(seconds(stamp_ns)), self._letter), left, self._top, _TEXT)
+        left += draw_mask(bar, _clock_mask(clock_text(seconds(stamp_ns)), self._letter), left, self._top, _TEXT)
         left += round(0.9 * self._letter)
-        left += draw_mask(bar, text_mask(state_text(mission, estimate), self._letter), left, self._top, _TEXT)
+        left += draw_mask(bar, _text_mask(state_text(mission, estimate), self._letter), left, self._top, _TEXT)
         right = bar.shape[1]
         for part in reversed(self._parts):
             begin = right - part.shape[1]
@@ -85,18 +90,25 @@ class StatusBar:
         px, middle, tick = length_um / self._um_per_px, 0.5 * self._height, 0.3 * self._letter
         bar = np.array([(1.0, middle), (1.0 + px, middle)])
         ends = [np.array([(x, middle - tick), (x, middle + tick)]) for x in bar[:, 0]]
-        return self._part(px + 2.0, length_text(length_um), lambda layer: layer.lines([bar, *ends], _TEXT, self._line))
+        return self._part(px + 2.0, length_text(length_um), _TEXT, [bar, *ends])
 
-    def _part(self, sign_px: float, words: str, draw: Callable[[Layer], None]) -> Picture:
-        """A sign of some width with its words to the right of it."""
-        gap, mask = round(0.45 * self._letter), text_mask(words, self._letter)
+    def _part(
+        self,
+        sign_px: float,
+        words: str,
+        colour: Rgb,
+        lines: Sequence[Points],
+        heads: Sequence[Points] = (),
+        width: float = 1.0,
+    ) -> Picture:
+        """A sign of some px in the given colour, by `Layer.lines`, with its words to the right of it."""
+        gap, mask = round(0.45 * self._letter), _text_mask(words, self._letter)
         sign = math.ceil(sign_px)
         picture = np.empty((self._height, sign + gap + mask.shape[1] + round(1.2 * self._letter), 3), np.uint8)
         picture[:] = bgr(_GROUND)
         draw_mask(picture, mask, sign + gap, self._top, _TEXT)
         layer = Layer(picture.shape[:2])
-        draw(layer)
-        layer.finish()
+        layer.lines(lines, heads, colour, width * self._line)
         layer.blend(picture[..., 0].copy(), picture)
         return picture
 
@@ -131,3 +143,37 @@ def state_text(mission: Mission | None, estimate: Estimate | None) -> str:
         words += ", robot not seen" if words else "robot not seen"
     words = printable(words)
     return words if len(words) <= _MOST_LETTERS else words[: _MOST_LETTERS - 1] + "…"
+
+
+@lru_cache(maxsize=8)
+def _font(height_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(height_px)
+
+
+@lru_cache(maxsize=512)
+def _text_mask(text: str, height_px: int) -> Picture:
+    """A text (h, w) on one line, 255 in letters; all texts of one height have one baseline and the same h."""
+    font = _font(height_px)
+    shown = text[:_LONGEST_TEXT].replace(_MICRO, "u")
+    width = max(int(np.ceil(font.getlength(shown))), 1)
+    picture = Pillow.new("L", (width, round(1.3 * height_px)), 0)
+    draw = ImageDraw.Draw(picture)
+    draw.text((0, 0), shown, fill=255, font=font)
+    for place in (n for n, letter in enumerate(text[: len(shown)]) if letter == _MICRO):
+        left, top, _, bottom = font.getbbox("u")
+        stem = font.getlength(shown[:place]) + left + 0.5
+        tail = (stem, 0.5 * (top + bottom), stem + _STEM * height_px, bottom + _TAIL * height_px)
+        draw.rectangle(tuple(map(round, tail)), fill=255)
+    mask: Picture = np.asarray(picture)
+    return mask
+
+
+def _clock_mask(text: str, height_px: int) -> Picture:
+    """Picture of a text that changes all the time: every digit is as wide as the widest, so nothing jumps."""
+    widest = max(_text_mask(digit, height_px).shape[1] for digit in _DIGITS)
+    parts = []
+    for letter in text:
+        mask = _text_mask(letter, height_px)
+        missing = widest - mask.shape[1] if letter in _DIGITS else 0
+        parts.append(np.pad(mask, ((0, 0), (missing // 2, missing - missing // 2))) if missing else mask)
+    return np.hstack(parts)

@@ -98,7 +98,7 @@ class LiveSummary:
 
     def add(self, tick: Tick) -> bool:
         """Take the next tick; whether the panel changes with it."""
-        news = any(getattr(tick, name) is not getattr(self._last, name) for name in _NEWS)
+        news = bool(tick.news(self._last, _NEWS))
         self._statistics.write(tick)
         self._quality.write(tick)
         self._motion.write(tick)

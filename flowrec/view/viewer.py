@@ -1,8 +1,9 @@
-"""Rerun's viewer: where it is, whether there is a screen for it, and its start, bound to this machine only."""
+"""Rerun's viewer and its catalog server: whether they are here, and their start, bound to this machine only."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import platform
 import shutil
@@ -10,11 +11,16 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
+from flowrec.core import FlowrecError, UsageError
+
+DATASET = "sessions"
 LOOPBACK = "127.0.0.1"  # Rerun's own default is every interface
 _POLL_S = 0.05
+_T = TypeVar("_T")
 _ENVIRONMENT = {
     "RERUN_APP_ONLY": "true",  # no questions on its first run
     # No report of its use to tel.rerun.io: CI turns the analytics off, whatever the user's own setting is.
@@ -61,12 +67,26 @@ def free_port() -> int:
 
 def wait_for_server(port: int, limit_s: float, given_up: Callable[[], bool] = lambda: False) -> bool:
     """Wait until a server on this machine accepts connections; False if it does not within the time limit."""
-    end = time.monotonic() + limit_s
-    while time.monotonic() < end and not given_up():
+
+    def accepts() -> bool | None:
+        if given_up():
+            return False
         with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=1.0):
             return True
+        return None
+
+    return bool(until(accepts, limit_s))
+
+
+def until(done: Callable[[], _T | None], limit_s: float) -> _T | None:
+    """The first result that is not None, within a time limit."""
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end:
+        result = done()
+        if result is not None:
+            return result
         time.sleep(_POLL_S)
-    return False
+    return None
 
 
 def url(port: int) -> str:
@@ -124,3 +144,28 @@ def open_viewer(path: Path | str) -> str:
         return f"{path}: Rerun's viewer does not start ({error.strerror or error}); try `rerun {path}`"
     leave(process)
     return ""
+
+
+@contextlib.contextmanager
+def serve_recordings(recordings: Sequence[Path], port: int | None = None) -> Iterator[str]:
+    """Serve recordings as a dataset for as long as the block runs; yields the URL for Rerun and its clients.
+
+    Raises
+    ------
+    UsageError : the server's packages are not installed.
+    FlowrecError : the server does not start.
+    """
+    if importlib.util.find_spec("datafusion") is None:
+        raise UsageError("--serve needs Rerun's catalog, which is not installed: pip install 'flowrec[catalog]'")
+    from rerun.server import Server
+
+    try:
+        # Rerun's own default is every interface.
+        server = Server(host=LOOPBACK, port=port, datasets={DATASET: [str(path) for path in recordings]})
+    except (RuntimeError, ValueError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise FlowrecError(f"the server can not be started ({reason}); choose another --port") from error
+    try:
+        yield server.url()
+    finally:
+        server.shutdown()

@@ -22,8 +22,8 @@ import pytest
 
 from flowrec.console import console as console_module
 from flowrec.console.app import application
-from flowrec.console.board import MOST_PAGES, Board, PageProgress
-from flowrec.console.messages import CommandReply, RunEnded
+from flowrec.console.board import MOST_PAGES, NOTHING, Board
+from flowrec.console.console import CommandReply, RunEnded
 from flowrec.console.page_state import PageState
 from flowrec.core.enums import Action
 from flowrec.core.errors import UsageError
@@ -263,13 +263,12 @@ def test_pages_that_flood_the_run_are_refused_after_ten_commands_in_a_second(
 
 def test_an_event_is_sent_to_a_page_once(scene: Scene) -> None:
     async def seen() -> list[list[str]]:
-        board, shown, told = Board(scene, "a.mcap"), PageProgress(), []
+        board, shown, told = Board(scene, "a.mcap"), NOTHING, []
         for text in ("first", None, "second", None):
             changes = {} if text is None else {"event": Event(1, "info", text)}
             board.take(Batch(1, [changes], {}))
-            news = await board.news(shown)
-            shown = news.shown
-            told.append([event["text"] for event in json.loads(news.words)["events"]])
+            shown, words, _ = await board.news(shown)
+            told.append([event["text"] for event in json.loads(words)["events"]])
         return told
 
     assert asyncio.run(seen()) == [["first"], [], ["second"], []]

@@ -14,10 +14,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from flowrec.exports.report import style
+from flowrec.exports.report.curve_figures import MotionFigure, PathFlowFigure
 from flowrec.exports.report.map_figure import MapFigure, _panels
-from flowrec.exports.report.motion_figure import MotionFigure
 from flowrec.exports.report.path_figure import PathFigure, scale_bar
-from flowrec.exports.report.path_flow_figure import PathFlowFigure
 from flowrec.exports.report.report_data import ReportData, picture_of
 from flowrec.store.session import Session
 from tests.outlets import primes as p

@@ -72,15 +72,15 @@ def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypat
     (tmp_path / "secret.mcap").write_bytes(DRAFT.build())
     drawn = []
 
-    def drawn_beside(_target, _scene, _ticks, replayed, *_, **__):
-        drawn.append(replayed)
+    def drawn_beside(_part, _scene, ticks, *_, **__):
+        drawn.append(len(ticks) > 1)
 
     monkeypatch.setattr("flowrec.exports.rrd.write_rrd", drawn_beside)
     for name in ("../secret.mcap", str(tmp_path / "secret.mcap"), "..", "a\0b", ""):
         parent = text("flowrec.parent") + packed_map({"file": name, "sha256": "0"})
         head = tuple(part for part in DRAFT.head if not part[1].startswith(text("flowrec.parent")))
         export(file_of(inner, replace(DRAFT, head=(*head, (METADATA, parent)))), overwrite=True)
-    assert drawn == [None] * 5
+    assert drawn == [False] * 5
 
 
 def test_an_image_that_promises_more_than_it_has_is_refused(tmp_path):

@@ -128,7 +128,7 @@ def test_no_text_of_a_csv_is_a_formula_and_each_can_be_had_back_exactly(tmp_path
     batch = pyarrow.record_batch({"text": pyarrow.array(texts, pyarrow.string()), "number": [-1.5] * len(texts)})
     exporter = CsvExport()
     with exporter.open_writer(tmp_path / "a.csv", exporter.select(batch.schema)) as writer:
-        writer.write(exporter.select(batch))
+        writer.write_batch(exporter.select(batch))
     with (tmp_path / "a.csv").open(newline="", encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))
     assert [row["text"].removeprefix("'") for row in rows] == [text or "" for text in texts]

@@ -25,9 +25,9 @@ from flowrec.core.summary import Row
 from flowrec.core.system.outputs import OutputError
 from flowrec.exports.report import page as pages
 from flowrec.exports.report import style
+from flowrec.exports.report.curve_figures import RecordingFigure
 from flowrec.exports.report.curves import BUCKETS, CurveBuilder
 from flowrec.exports.report.explanations import MEANINGS, OUTCOMES
-from flowrec.exports.report.recording_figure import RecordingFigure
 from flowrec.exports.report.report_data import ReportData
 from flowrec.exports.report.timeline_figure import TimelineFigure
 from flowrec.store.session_file import WriterOptions

@@ -73,7 +73,7 @@ def returns(call: Callable[[], object]) -> bool:
 def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
     scene: Scene, ticks: list[Tick], blow: signal.Signals
 ) -> None:
-    live = LiveView(scene, "serve", max_hz=50)
+    live = LiveView(scene, "serve")
     assert live.pid is not None
     live.write(ticks[0])
     os.kill(live.pid, blow)
@@ -110,7 +110,7 @@ def test_a_viewer_receives_every_tick_and_a_smaller_image_and_its_server_stays_u
     image = cv2.resize(ticks[0].frame.image, (1600, 1280))  # type: ignore[union-attr]
     program = viewer.executable()
     assert program is not None
-    with LiveView(scene, "serve", max_hz=20) as live:
+    with LiveView(scene, "serve") as live:
         received = tmp_path / "received.rrd"
         listener = subprocess.Popen(
             [program, live.url, "--save", received], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL

@@ -18,13 +18,14 @@ from flowrec.physics.chip.registration import Calibration
 from flowrec.physics.flow.sampling import sample
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.view import colours, flow_values, maps
+from flowrec.view.camera_pictures import WindowCompleter
 from flowrec.view.colours import ColourScale
+from flowrec.view.entities import TIME_TO_GO
 from flowrec.view.feed import Batch
 from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.logger import TickLogger
 from flowrec.view.scene import Scene
 from flowrec.view.summary_text import LiveSummary, registration_remark
-from flowrec.view.window_images import WindowCompleter
 
 
 class Record:
@@ -97,7 +98,7 @@ def test_a_map_of_the_time_to_go_tells_far_from_unreachable(scene: Scene, ticks:
     seen = record.map("/plan/time\\ to\\ go/map")
     assert (seen[~fluid] == colours.SOLID).all()
     assert (seen[:, -20:][fluid[:, -20:]] == colours.UNREACHABLE).all()
-    assert "time to go" in logger.present
+    assert TIME_TO_GO in logger.present
     row = int(np.argmax(fluid[:, :-20].sum(1)))
     assert seen[row, -30].astype(int).sum() > seen[row, 10].astype(int).sum()  # lighter is farther
     logger.log(Tick(1, route=route))
@@ -115,7 +116,7 @@ def test_a_scale_holds_its_largest_value_on_few_round_ticks(largest: float) -> N
 
 
 def test_the_ticks_of_the_colour_bar_stand_where_their_colour_is(scene: Scene) -> None:
-    scale, bar = ColourScale.up_to(500.0, "speed"), maps.ColourBar.beside(scene)
+    scale, bar = ColourScale.up_to(500.0, "speed"), maps.ColourBar(scene)
     image, _ = bar.strip(scale)
     marks, numbers = bar.ticks(scale)
     words = numbers.labels.as_arrow_array().to_pylist()  # type: ignore[union-attr]
@@ -158,14 +159,14 @@ def test_the_branches_of_a_narrow_network_all_have_arrows(scene: Scene) -> None:
 @pytest.mark.parametrize(("angle_deg", "mirror"), [(0.0, False), (30.0, False), (-80.0, True)])
 def test_pictures_of_any_resolution_lie_on_each_other(scene: Scene, angle_deg: float, mirror: bool) -> None:
     turned = replace(scene, calibration=Calibration(0.7, (30.0, -12.0), angle_deg, mirror))
-    place = turned.mask_placement()
+    place = turned.mask_to_plane()
     column_row = np.array([10.0, 20.0])  # a pixel of the mask, whose centre Rerun counts half a pixel further
-    in_plane = place.offset + place.scale * (place.axes @ (column_row + 0.5))
+    in_plane = place[:, :2] @ (column_row + 0.5) + place[:, 2]
     assert np.allclose(turned.to_plane(4.0 * column_row), in_plane)
     left, top, right, bottom = turned.chip_bounds()
     assert left < in_plane[0] < right and top < in_plane[1] < bottom
-    preview = turned.preview_placement(3)
-    assert np.allclose((column_row + 0.5) * preview.scale + preview.offset, 3 * column_row + 0.5)
+    preview = turned.preview_to_plane(3)
+    assert np.allclose(preview[:, :2] @ (column_row + 0.5) + preview[:, 2], 3 * column_row + 0.5)
 
 
 def test_arrows_turn_with_the_camera(scene: Scene, ticks: list[Tick]) -> None:
@@ -280,7 +281,7 @@ def test_the_outcome_of_a_run_is_amber_if_its_track_is_doubtful_and_else_green(s
         done = replace(mission, finished=True, outcome=Outcome.REACHED)
         for tick in (Tick(0, track=at, mission=replace(mission, finished=False)), Tick(1, track=at, mission=done)):
             summary.add(tick)
-            logger.doubtful = summary.doubtful
+            logger.states.doubtful = summary.doubtful
             logger.log(tick)
         shades = np.asarray(record.logged["/Mission"].colors.as_arrow_array().to_pylist()[-1]).ravel()
         found.append(int(shades[-1]) >> 8)

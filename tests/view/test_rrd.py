@@ -76,7 +76,7 @@ class File:
 @pytest.fixture(scope="module")
 def single(tmp_path_factory: pytest.TempPathFactory, scene: Scene, ticks: list[Tick]) -> File:
     path = tmp_path_factory.mktemp("single") / "session.rrd"
-    write_rrd(Output(path, RRD), scene, ticks)
+    write_rrd(path, scene, {"": ticks})
     return File(path)
 
 
@@ -86,7 +86,8 @@ def double(
 ) -> File:
     path = tmp_path_factory.mktemp("double") / "session.rrd"
     # As a replay comes: without frames, and with another flow, faster in the upper branch.
-    write_rrd(Output(path, RRD), scene, ticks, (replace(tick, frame=None) for tick in made_up(120, seed=1, share=0.9)))
+    again = (replace(tick, frame=None) for tick in made_up(120, seed=1, share=0.9))
+    write_rrd(path, scene, {"recorded": ticks, "replayed": again})
     return File(path)
 
 
@@ -109,7 +110,7 @@ def test_everything_that_a_view_of_a_replay_asks_for_is_in_the_file(double: File
 
 def test_a_view_that_would_stay_empty_is_left_out(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
     bare = [replace(tick, true_field=None, truth=None, refined=None) for tick in ticks[:5]]
-    write_rrd(Output(tmp_path / "bare.rrd", RRD), scene, bare)
+    write_rrd(tmp_path / "bare.rrd", scene, {"": bare})
     views = File(tmp_path / "bare.rrd").views
     assert "Assumed flow" in views
     assert not {
@@ -122,7 +123,7 @@ def test_the_timelines_are_session_time_to_the_nanosecond_and_frame(
 ) -> None:
     late = 123_456_789_123_456_789  # four years, which a float does not hold to the nanosecond
     tick = replace(ticks[7], stamp_ns=late)
-    write_rrd(Output(tmp_path / "late.rrd", RRD), scene, [tick])
+    write_rrd(tmp_path / "late.rrd", scene, {"": [tick]})
     file = File(tmp_path / "late.rrd")
     assert set().union(*file.times.values()) == {"session time", "frame"}
     stamps = [stamp for stamp in file.columns["/camera/measured/image"]["session time"] if stamp is not None]
@@ -153,14 +154,18 @@ def test_a_file_that_breaks_off_does_not_appear(tmp_path: Path, scene: Scene, ti
         yield from ticks[:3]
         raise SessionError("damaged")
 
-    with pytest.raises(SessionError, match="damaged"):
-        write_rrd(Output(tmp_path / "half.rrd", RRD), scene, breaks_off())
+    with pytest.raises(SessionError, match="damaged"), Output(tmp_path / "half.rrd", RRD).new_file() as part:
+        write_rrd(part, scene, {"": breaks_off()})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_place_that_cannot_be_written_is_said_in_one_line(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
-    with pytest.raises(SessionError, match=r"nowhere: no such directory; .*choose another place"):
-        write_rrd(Output(tmp_path / "nowhere" / "session.rrd", RRD), scene, ticks)
+    output = Output(tmp_path / "nowhere" / "session.rrd", RRD)
+    with (
+        pytest.raises(SessionError, match=r"nowhere: no such directory; .*choose another place"),
+        output.new_file() as part,
+    ):
+        write_rrd(part, scene, {"": ticks})
 
 
 def test_the_view_opens_at_the_start_and_plays(single: File) -> None:
@@ -187,7 +192,7 @@ def test_marks_alarms_and_losses_have_lanes_with_words_and_the_error_ends_with_t
                 drops=drops if i >= 40 else None,
             )
 
-    write_rrd(Output(tmp_path / "eventful.rrd", RRD), scene, eventful())
+    write_rrd(tmp_path / "eventful.rrd", scene, {"": eventful()})
     file = File(tmp_path / "eventful.rrd")
 
     def states(lane: str) -> list[object]:
@@ -206,7 +211,7 @@ def test_marks_alarms_and_losses_have_lanes_with_words_and_the_error_ends_with_t
 
 def test_text_of_a_session_is_no_markdown_in_the_summary(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
     summary = summary_document(["a|b"], [("outcome", "[x](http://x) <script> | \x1b[31m", None)], ["*remark*"])
-    write_rrd(Output(tmp_path / "s.rrd", RRD), scene, ticks[:2], summary=summary)
+    write_rrd(tmp_path / "s.rrd", scene, {"": ticks[:2]}, summary=summary)
     (text,) = File(tmp_path / "s.rrd").columns["/summary"]["TextDocument:text"][-1]  # type: ignore[misc]
     assert "a\\|b" in text
     assert "\\[x\\]\\(http" in text
@@ -231,5 +236,5 @@ def test_rerun_is_waited_for_only_as_long_as_the_file_grows(
         raise RuntimeError("timed out")
 
     monkeypatch.setattr(RecordingStream, "flush", flush)
-    write_rrd(Output(tmp_path / "slow.rrd", RRD), scene, ticks[:2])
+    write_rrd(tmp_path / "slow.rrd", scene, {"": ticks[:2]})
     assert len(waited) == 3 and max(waited) <= 60.0

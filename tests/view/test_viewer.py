@@ -9,7 +9,6 @@ import cv2
 import pytest
 
 from flowrec.core.errors import FlowrecError
-from flowrec.core.system.outputs import RRD, Output
 from flowrec.core.topics import Tick
 from flowrec.view import viewer
 from flowrec.view.rrd_file import write_rrd
@@ -70,7 +69,7 @@ def test_a_screenshot_shows_all_views_without_complaint_and_rerun_takes_no_notes
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
-    write_rrd(Output(tmp_path / "session.rrd", RRD), scene, ticks)
+    write_rrd(tmp_path / "session.rrd", scene, {"": ticks})
     (tmp_path / "out").mkdir()
     try:
         problems = screenshot(tmp_path / "session.rrd", tmp_path / "out" / "shot.png", time_s=1.5, size=(1280, 800))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flowrec.core import seconds
 
 BUCKETS = 600  # of 0.3 mm in the widest figure
+_MOST_SPANS = 200
 _GAP = 4.0  # of the usual interval of values: a longer one interrupts the line
 
 Floats = NDArray[np.float64]
@@ -102,22 +103,18 @@ class Span:
 
 
 class SpanBuilder:
-    """Takes the states of successive ticks; '' is none. No more than `most` spans are kept."""
+    """Takes the states of successive ticks; '' is none. No more than _MOST_SPANS are kept."""
 
-    def __init__(self, most: int = 200) -> None:
+    def __init__(self) -> None:
         self.spans: list[Span] = []
-        self.left_out = 0
-        self._most = most
         self._name, self._from_s = "", 0.0
 
     def add(self, time_s: float, name: str) -> None:
         """The state from now on."""
         if name == self._name:
             return
-        if self._name and len(self.spans) < self._most:
+        if self._name and len(self.spans) < _MOST_SPANS:
             self.spans.append(Span(self._name, self._from_s, time_s))
-        elif self._name:
-            self.left_out += 1
         self._name, self._from_s = name, time_s
 
     def end(self, time_s: float) -> None:

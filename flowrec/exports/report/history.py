@@ -37,6 +37,10 @@ _SPEED_OVER_S = 0.25  # the speed over ground is a mean over at least this time
 _MOST_ALARMS = 8  # different ones; flowrec has three
 _LONGEST_NAME = 24  # letters of a phase or an alarm
 _REPORT_EVERY = 200  # ticks
+_SHOWN = (  # fields of a tick, in the order in which they are taken
+    *("event", "operator", "mission", "track", "estimate", "demand"),
+    *("health", "truth", "timing", "drops", "clocks", "losses"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,20 +98,6 @@ class History:
         self._builders: dict[str, CurveBuilder] = {}
         self.found = False
         self._position: tuple[int, NDArray[np.float64]] | None = None
-        self._by_field: dict[str, Callable[[Any], None]] = {
-            "event": self._event,
-            "operator": self._operator,
-            "mission": self._mission,
-            "track": self._track,
-            "estimate": self._estimate,
-            "demand": self._demand,
-            "health": self._health,
-            "truth": self._truth,
-            "timing": self._timing,
-            "drops": self._drops,
-            "clocks": self._clocks,
-            "losses": self._losses,
-        }
 
     @classmethod
     def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> History:
@@ -145,10 +135,46 @@ class History:
         """Take the next tick."""
         before, self.last = self.last, tick
         self.ticks += 1
-        for name, take in self._by_field.items():
-            message = getattr(tick, name)
-            if message is not None and message is not getattr(before, name):
-                take(message)
+        for message in tick.news(before, _SHOWN).values():
+            self._take(message)
+
+    def _take(self, message: Any) -> None:
+        """Take a new message of the last tick."""
+        stamp_ns: int = message.stamp_ns
+        now_s = seconds(stamp_ns)
+        match message:
+            case Event():
+                self._remark(Remark(now_s, message.text, level=message.level))
+            case OperatorEvent():
+                self._remark(Remark(now_s, message.text, action=message.action))
+            case Mission():
+                held = message.held_since_ns is not None and not message.finished
+                self.phases.add(now_s, _name(message.phase))
+                self.held.add(now_s, "held" if held else "")
+            case Track():
+                self.found |= message.seen
+                self.unseen.add(now_s, "" if message.seen else "not seen")
+            case Estimate():
+                self._estimate(message)
+            case Demand():
+                self._put(stamp_ns, demand_um_s=math.hypot(*message.velocity_um_s))
+                self._put(stamp_ns, error_um=message.error_um)
+            case Health():
+                self._health(message)
+            case Truth():
+                self._put(stamp_ns, true_x_um_s=message.flow_um_s[0], true_y_um_s=message.flow_um_s[1])
+            case Timing():
+                dropped, tick_ms = message.dropped_frames, message.total_ms
+                self._put(stamp_ns, tick_ms=tick_ms, queue_mb=message.queue_mb, dropped=dropped)
+            case Drops():
+                self.drops[message.topic] = message
+            case Clocks():
+                self.clocks = message
+                if message.rate:
+                    self._put(stamp_ns, late_ms=1e3 * message.late_s, latest_ms=1e3 * message.latest_s)
+            case CameraLosses():
+                self.losses = message
+                self._put(stamp_ns, lost=message.link + message.incomplete + message.driver + message.backlog)
 
     def _put(self, stamp_ns: int, **values: float) -> None:
         """Values that belong together: all of them, or none where one is not finite."""
@@ -159,26 +185,11 @@ class History:
                 self._builders[name] = CurveBuilder(self.first_ns, self.last_ns)
             self._builders[name].add(stamp_ns, float(value))
 
-    def _event(self, event: Event) -> None:
-        self._remark(Remark(seconds(event.stamp_ns), event.text, level=event.level))
-
-    def _operator(self, event: OperatorEvent) -> None:
-        self._remark(Remark(seconds(event.stamp_ns), event.text, action=event.action))
-
     def _remark(self, remark: Remark) -> None:
         if len(self.remarks) < _MOST_REMARKS:
             self.remarks.append(remark)
         else:
             self.remarks_left_out += 1
-
-    def _mission(self, mission: Mission) -> None:
-        now_s = seconds(mission.stamp_ns)
-        self.phases.add(now_s, _name(mission.phase))
-        self.held.add(now_s, "held" if mission.held_since_ns is not None and not mission.finished else "")
-
-    def _track(self, track: Track) -> None:
-        self.found |= track.seen
-        self.unseen.add(seconds(track.stamp_ns), "" if track.seen else "not seen")
 
     def _estimate(self, estimate: Estimate) -> None:
         if not self.found and self.last.track is not None:
@@ -204,10 +215,6 @@ class History:
         if tick.truth is not None and tick.truth.stamp_ns == stamp_ns:
             self._put(stamp_ns, estimate_error_um=math.dist(position_um, tick.truth.position_um))
 
-    def _demand(self, demand: Demand) -> None:
-        self._put(demand.stamp_ns, demand_um_s=math.hypot(*demand.velocity_um_s))
-        self._put(demand.stamp_ns, error_um=demand.error_um)
-
     def _health(self, health: Health) -> None:
         self._put(health.stamp_ns, nis=health.nis)
         now = set(map(_name, health.alarm.split("; ")[:_MOST_ALARMS])) - {""}
@@ -216,24 +223,6 @@ class History:
                 continue
             spans = self.alarms.setdefault(name, SpanBuilder())
             spans.add(seconds(health.stamp_ns), name if name in now else "")
-
-    def _truth(self, truth: Truth) -> None:
-        self._put(truth.stamp_ns, true_x_um_s=truth.flow_um_s[0], true_y_um_s=truth.flow_um_s[1])
-
-    def _timing(self, timing: Timing) -> None:
-        self._put(timing.stamp_ns, tick_ms=timing.total_ms, queue_mb=timing.queue_mb, dropped=timing.dropped_frames)
-
-    def _drops(self, drops: Drops) -> None:
-        self.drops[drops.topic] = drops
-
-    def _clocks(self, clocks: Clocks) -> None:
-        self.clocks = clocks
-        if clocks.rate:
-            self._put(clocks.stamp_ns, late_ms=1e3 * clocks.late_s, latest_ms=1e3 * clocks.latest_s)
-
-    def _losses(self, losses: CameraLosses) -> None:
-        self.losses = losses
-        self._put(losses.stamp_ns, lost=losses.link + losses.incomplete + losses.driver + losses.backlog)
 
 
 def _name(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -128,34 +129,29 @@ class ChangeFigure:
     def draw(self, data: ReportData, width_mm: float) -> Figure:
         assert self._before is not None and self._after is not None
         mask = data.scene.chip.mask
-        values = [speed(field, mask) for field in (self._before, self._after)]
-        scale = ColourScale.up_to(float(np.nanmax(values)), "speed")
-        panels = [Panel("recorded", values[0], scale), Panel("replayed", values[1], scale)]
-        panels += [_change(self._after, self._before, mask), *_deviation(self._after, mask)]
-        return draw_panels(panels, data, width_mm)
+        named = {"recorded": self._before, "replayed": self._after}
+        largest = max(float(np.nanmax(speed(field, mask))) for field in named.values())
+        return draw_panels(_panels_of(named, ColourScale.up_to(largest, "speed"), mask), data, width_mm)
 
 
 def _panels(data: ReportData) -> list[Panel]:
     mask, scale = data.scene.chip.mask, data.speed_scale()
-    named = {"assumed": data.assumed, "refined": data.refined}
-    panels = [Panel(name, speed(field, mask), scale) for name, field in named.items() if field is not None]
-    if data.refined is not None and data.assumed is not None:
-        panels.append(_change(data.refined, data.assumed, mask))
-    best = data.refined if data.refined is not None else data.assumed
-    panels += _deviation(best, mask) if best is not None else []
+    panels = _panels_of({"assumed": data.assumed, "refined": data.refined}, scale, mask)
     return [*panels, Panel("true", speed(data.truth, mask), scale)] if data.truth is not None else panels
 
 
-def _change(now: FlowField, was: FlowField, mask: NDArray[np.bool_]) -> Panel:
-    values = change(now, was, mask)
-    return Panel("change", values, scale_of(values, "change"))
-
-
-def _deviation(field: FlowField, mask: NDArray[np.bool_]) -> list[Panel]:
-    if field.std_um_s is None:
-        return []
-    values = uncertainty(field, mask)
-    return [Panel("deviation", values, scale_of(values, "uncertainty"), not_known(field, mask))]
+def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: NDArray[np.bool_]) -> list[Panel]:
+    """The speed of one or two fields, their change, and the deviation that the last one states."""
+    known = {name: field for name, field in named.items() if field is not None}
+    panels = [Panel(name, speed(field, mask), scale) for name, field in known.items()]
+    fields = list(known.values())
+    if len(fields) == 2:
+        values = change(fields[1], fields[0], mask)
+        panels.append(Panel("change", values, scale_of(values, "change")))
+    if fields and fields[-1].std_um_s is not None:
+        values = uncertainty(fields[-1], mask)
+        panels.append(Panel("deviation", values, scale_of(values, "uncertainty"), not_known(fields[-1], mask)))
+    return panels
 
 
 def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figure:
@@ -176,17 +172,11 @@ def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figur
         ax.remove()
     for ax, panel in zip(axes, panels, strict=False):
         shown = _show(ax, panel, box)
-        sign = "+" if panel.scale.table == "change" else ""
         bar = figure.colorbar(shown, ax=ax, shrink=0.9, aspect=16, pad=0.02, ticks=panel.scale.ticks)
-        bar.ax.set_yticklabels([f"{tick:{sign}g}" if tick else "0" for tick in np.round(panel.scale.ticks, 9)])
+        bar.ax.set_yticklabels(panel.scale.labels)
         bar.outline.set_visible(False)
-    scale_bar(axes[0], style_px_per_mm(um_per_px))
+    scale_bar(axes[0], 1.0 / (um_per_px * style.MM_PER_UM))  # pixels of the mask in a millimetre
     return figure
-
-
-def style_px_per_mm(um_per_px: float) -> float:
-    """Pixels of the mask in a millimetre."""
-    return 1.0 / (um_per_px * style.MM_PER_UM)
 
 
 def _show(ax: Axes, panel: Panel, box: tuple[slice, slice]) -> AxesImage:

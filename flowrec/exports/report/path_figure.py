@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.exports.report import style
 from flowrec.exports.report.report_data import ReportData
-from flowrec.view import arrow_grid, flow_arrows, speed
+from flowrec.view import Box, arrow_grid, flow_arrows, length_text, round_below, speed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +70,8 @@ class PathFigure:
         style.bare(ax)
         _background(ax, data)
         _flow(figure, ax, data)
-        _outline(ax, data)
+        for outline in data.scene.outlines():
+            ax.plot(*outline.T, color=style.QUIET, lw=0.5, zorder=2)
         ax.set_xlim(left, right)
         ax.set_ylim(bottom, top)
         ax.set_aspect("equal")
@@ -86,29 +86,26 @@ def scale_bar(ax: Axes, per_mm: float) -> None:
     from matplotlib.transforms import ScaledTranslation
 
     left, right = ax.get_xlim()
-    longest_mm = _BAR_SHARE * abs(right - left) / per_mm
-    power = 10.0 ** np.floor(np.log10(longest_mm))
-    length_mm = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= longest_mm)
+    length_mm = round_below(_BAR_SHARE * abs(right - left) / per_mm)
     share = length_mm * per_mm / abs(right - left)
     figure = ax.get_figure()
     assert figure is not None
     below = ax.transAxes + ScaledTranslation(0.0, -5.0 / _PT_PER_INCH, figure.dpi_scale_trans)
     ax.plot([0.0, share], [0.0, 0.0], transform=below, color=style.INK, lw=1.6, clip_on=False)
-    text = f"{length_mm:g} mm" if length_mm >= 1.0 else f"{1e3 * length_mm:g} µm"
-    ax.text(share + 0.01, 0.0, text, transform=below, va="center", ha="left")
+    ax.text(share + 0.01, 0.0, length_text(1e3 * length_mm), transform=below, va="center", ha="left")
 
 
-def _bounds(data: ReportData) -> tuple[float, float, float, float]:
+def _bounds(data: ReportData) -> Box:
     """Left, top, right, bottom of the fluid with a margin, within the chip, in the picture plane."""
-    chip = data.scene.chip
-    rows, columns = np.nonzero(chip.mask)
-    corners = np.array([(x, y) for x in (columns.min(), columns.max()) for y in (rows.min(), rows.max())], np.float64)
-    places = data.scene.to_plane(corners * chip.um_per_px)
-    margin = _MARGIN * float(np.ptp(places[:, 0]))
+    left, top, right, bottom = data.scene.fluid_bounds()
+    margin = _MARGIN * (right - left)
     chip_left, chip_top, chip_right, chip_bottom = data.scene.chip_bounds()
-    left, top = places.min(axis=0) - margin
-    right, bottom = places.max(axis=0) + margin
-    return max(left, chip_left), max(top, chip_top), min(right, chip_right), min(bottom, chip_bottom)
+    return (
+        max(left - margin, chip_left),
+        max(top - margin, chip_top),
+        min(right + margin, chip_right),
+        min(bottom + margin, chip_bottom),
+    )
 
 
 def _background(ax: Axes, data: ReportData) -> None:
@@ -126,12 +123,9 @@ def _on_mask(ax: Axes, data: ReportData, values: NDArray[np.float64], **how: Any
     """Values (h, w) of the mask's pixels, where the camera sees them."""
     from matplotlib.transforms import Affine2D
 
-    placement = data.scene.mask_placement()
-    (a, b), (c, d) = placement.scale * placement.axes
-    x, y = placement.offset
     height, width = values.shape
     shown = ax.imshow(values, extent=(0.0, width, height, 0.0), interpolation="nearest", **how)
-    shown.set_transform(Affine2D(np.array([[a, b, x], [c, d, y], [0.0, 0.0, 1.0]])) + ax.transData)
+    shown.set_transform(Affine2D(np.vstack((data.scene.mask_to_plane(), (0.0, 0.0, 1.0)))) + ax.transData)
     return shown
 
 
@@ -149,11 +143,10 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
     bar.set_label("speed of the flow (µm/s)")
     bar.outline.set_visible(False)
     origins, vectors, _ = flow_arrows(scene, field, arrow_grid(scene))
-    ends = origins + vectors
     if len(origins):
         ax.quiver(
             *origins.T,
-            *(ends - origins).T,
+            *vectors.T,
             angles="xy",
             scale_units="xy",
             scale=1.0,
@@ -165,15 +158,6 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
             alpha=0.75,
             zorder=3,
         )
-
-
-def _outline(ax: Axes, data: ReportData) -> None:
-    """The walls of the mask."""
-    chip = data.scene.chip
-    contours, _ = cv2.findContours(chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    for contour in contours:
-        around = np.concatenate([contour, contour[:1]])[:, 0] * chip.um_per_px
-        ax.plot(*data.scene.to_plane(around).T, color=style.QUIET, lw=0.5, zorder=2)
 
 
 def _paths(ax: Axes, data: ReportData) -> None:
@@ -206,13 +190,8 @@ def _directions(ax: Axes, path: NDArray[np.float64]) -> None:
         return
     for share in (np.arange(_HEADS) + 0.5) / _HEADS:
         middle = share * along[-1]
-        ends = [
-            (
-                np.interp(middle + shift * along[-1], along, way[:, 0]),
-                np.interp(middle + shift * along[-1], along, way[:, 1]),
-            )
-            for shift in (-_HEAD_SHARE, _HEAD_SHARE)
-        ]
+        around = middle + along[-1] * np.array([-_HEAD_SHARE, _HEAD_SHARE])
+        begin, end = zip(*(np.interp(around, along, axis) for axis in way.T), strict=True)
         arrow = {
             "arrowstyle": "-|>,head_length=0.35,head_width=0.22",
             "color": style.VERMILLION,
@@ -221,7 +200,7 @@ def _directions(ax: Axes, path: NDArray[np.float64]) -> None:
             "shrinkB": 0.0,
             "mutation_scale": 11.0,
         }
-        ax.annotate("", ends[1], ends[0], arrowprops=arrow, zorder=8)
+        ax.annotate("", end, begin, arrowprops=arrow, zorder=8)
 
 
 def _place(ax: Axes, at: NDArray[np.float64], radius: float, name: str, colour: str, *, below: bool = False) -> None:

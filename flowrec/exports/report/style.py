@@ -99,7 +99,10 @@ def bare(ax: Axes) -> None:
 
 
 def legend_above(ax: Axes, columns: int = 4) -> None:
-    """A legend above an axis, where no curve is."""
+    """A legend above an axis, where no curve is; of a narrow figure in two columns at most."""
+    figure = ax.get_figure()
+    assert figure is not None
+    narrow = figure.bbox.width / PAGE_DPI * MM_PER_INCH <= NARROW_MM + 0.5
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         ax.legend(
@@ -107,7 +110,7 @@ def legend_above(ax: Axes, columns: int = 4) -> None:
             labels,
             loc="lower left",
             bbox_to_anchor=(0.0, 1.0),
-            ncols=columns,
+            ncols=min(columns, 2) if narrow else columns,
             columnspacing=1.2,
             handletextpad=0.5,
         )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import Observations, Phase
 from flowrec.exports.report import style
-from flowrec.exports.report.curves import Curve, Span
+from flowrec.exports.report.curves import Curve
 from flowrec.exports.report.history import History
 from flowrec.exports.report.report_data import ReportData
 
@@ -112,9 +112,3 @@ def observation_points(
         label="observations",
         zorder=zorder,
     )
-
-
-def spans(ax: Axes, found: list[Span], y: float, height: float, colour: str, least_s: float) -> None:
-    """Bars for spans of time, none of them shorter than can be seen."""
-    bars = [(span.from_s, max(span.to_s - span.from_s, least_s)) for span in found]
-    ax.broken_barh(bars, (y - 0.5 * height, height), facecolors=colour, lw=0.0)

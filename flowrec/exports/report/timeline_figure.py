@@ -11,12 +11,13 @@ from flowrec.exports.report import style
 from flowrec.exports.report.curves import Span
 from flowrec.exports.report.history import History, Remark
 from flowrec.exports.report.report_data import ReportData
-from flowrec.exports.report.time_axis import panels, spans
+from flowrec.exports.report.time_axis import panels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LANE_MM = 5.0
+_BAR_HEIGHT = 0.55  # of a span, of its lane
 _LEAST_WIDTH = 0.004  # of the time axis: shorter spans are drawn this long
 _LABEL_MM = 6.0  # width of a number: moments that are nearer to each other share a label
 ALARMS: dict[str, str] = {
@@ -80,7 +81,8 @@ class TimelineFigure:
         figure, (ax,) = panels(history, width_mm, [_LANE_MM * max(len(lanes), 1)])
         least_s = _LEAST_WIDTH * (history.last_s - history.first_s)
         for y, lane in enumerate(lanes):
-            spans(ax, list(lane.spans), y, 0.55, lane.colour, least_s)
+            bars = [(span.from_s, max(span.to_s - span.from_s, least_s)) for span in lane.spans]
+            ax.broken_barh(bars, (y - 0.5 * _BAR_HEIGHT, _BAR_HEIGHT), facecolors=lane.colour, lw=0.0)
             times_s = [time_s for time_s, _ in lane.moments]
             ax.plot(times_s, [y] * len(times_s), ls="none", marker="|", ms=7, mew=1.2, color=lane.colour)
             apart_s = _LABEL_MM / width_mm * (history.last_s - history.first_s)

@@ -1,6 +1,9 @@
-"""Images of which only a region was recorded (store/roi.py), completed with an older image for people to look at."""
+"""The camera's images for people to look at: as JPEG, and completed where only a region was recorded (store/roi.py)."""
 
 from __future__ import annotations
+
+import cv2
+import numpy as np
 
 from flowrec.core import Image
 from flowrec.store import nonzero_window
@@ -28,3 +31,12 @@ class WindowCompleter:
         completed = self._dimmed.copy()
         completed[y0:y1, x0:x1] = image[y0:y1, x0:x1]
         return completed
+
+
+def encode_jpeg(image: Image, bits: int, quality: int) -> bytes:
+    """An image (h, w) of that many bits as JPEG, of its upper 8 bits."""
+    if bits > 8:
+        image = (image >> (bits - 8)).astype(np.uint8)
+    done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return jpeg.tobytes()
