@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
-from flowrec.core import FIXED, Message, SessionError, TopicTable, seconds, shape_error
+from flowrec.core import FIXED, Message, SessionError, TopicTable, seconds
 from flowrec.store.channels import SessionContents
 from flowrec.store.digest import FileDigest
 from flowrec.store.mcap_format import Record
@@ -83,8 +84,7 @@ class Audit:
         """The file as run_files.py compares it with others."""
         part = self.header.part if self.header is not None else None
         counts = {self.topics.by_field[name].path: count for name, count in self.counts.items()}
-        version, size_bytes = self.flowrec_version, self.size_bytes
-        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, version, size_bytes)
+        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.size_bytes)
 
 
 def audit(
@@ -109,7 +109,8 @@ def audit(
         contents = SessionContents(path)
         found = Audit(path, contents.source.size)
     except (UnfinishedError, DamageError) as error:
-        contents = _contents_without_index(path)
+        with contextlib.closing(McapReader(path)) as source:
+            contents = SessionContents(path, scan(source).summary)
         found = Audit(path, contents.source.size, finished=False)
         found.why_not = error.what if isinstance(error, DamageError) else _first_part(error, path)
     with contents:
@@ -162,45 +163,30 @@ class _ChunkAudit:
         self._see = see
         self._last_ns: dict[str, int] = {}
         self._last_stamp_ns: dict[str, int] = {}
-        self._any = False
 
-    def take(self, offset: int, records: list[Record]) -> None:
+    def take(self, place: ChunkIndex, records: list[Record]) -> None:
         found = self._found
-        self.digest.add(offset, records)
+        self.digest.add(place, records)
         for record in records:
             name = self._contents.fields.get(record.channel)
             if name is None:
                 continue
-            found.counts[name] += 1
-            found.first_ns = min(found.first_ns, record.log_ns) if self._any else record.log_ns
+            found.first_ns = min(found.first_ns, record.log_ns) if found.counts else record.log_ns
             found.last_ns = max(found.last_ns, record.log_ns)
-            self._any = True
+            found.counts[name] += 1
             found.backwards[name] += record.log_ns < self._last_ns.get(name, record.log_ns)
             self._last_ns[name] = record.log_ns
             try:
                 message = self._contents.decode(record)
-                wrong = shape_error(message)
             except SessionError as error:
-                wrong = str(error)
-            if wrong:
                 found.undecodable[name] += 1
-                fault = f"{found.topics.by_field[name].path} in the chunk at byte {offset}: {wrong}"
-                found.first_undecodable = found.first_undecodable or fault
+                path, offset = found.topics.by_field[name].path, place.chunk_start_offset
+                found.first_undecodable = found.first_undecodable or f"{path} in the chunk at byte {offset}: {error}"
                 continue
             stamp_ns = message.stamp_ns
             found.stamps_backwards[name] += stamp_ns < self._last_stamp_ns.get(name, stamp_ns)
             self._last_stamp_ns[name] = stamp_ns
             self._see(name, record.log_ns, message)
-
-
-def _contents_without_index(path: Path) -> SessionContents:
-    """The contents of a file whose index is missing or damaged, by a scan."""
-    source = McapReader(path)
-    try:
-        found = scan(source)
-    finally:
-        source.close()
-    return SessionContents(path, found.summary)
 
 
 def disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool, str]]:

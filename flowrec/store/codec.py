@@ -70,24 +70,17 @@ class Codec:
     has_unix_time: bool = False
 
 
-_CODECS: dict[tuple[type[Any], str], Codec] = {}
-
-
+@functools.cache
 def codec_of(message_type: type[Any], path: str = "") -> Codec:
     """The codec of a message type other than Frame, which has several (frame_encodings.py); `path`: as of schema_of."""
-    codec = _CODECS.get((message_type, path))
-    if codec is None:
-        if message_type is Frame:
-            raise TypeError("the codec of a Frame depends on its encoding")
-        if message_type is Event:
-            codec = _event_codec()
-        elif message_type is OperatorEvent:
-            codec = _operator_codec()
-        else:
-            schema = schema_of(message_type, path)
-            codec = Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
-        _CODECS[message_type, path] = codec
-    return codec
+    if message_type is Frame:
+        raise TypeError("the codec of a Frame depends on its encoding")
+    if message_type is Event:
+        return _event_codec()
+    if message_type is OperatorEvent:
+        return _operator_codec()
+    schema = schema_of(message_type, path)
+    return Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
 
 
 def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
@@ -226,38 +219,37 @@ def _large_array(number: int, array: NDArray[Any]) -> Payload:
 
 def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memoryview, int], Any]:
     parse = schema.wire.FromString
-    forms = message_fields(message_type)
-    unpackers = [_unpacker(form) for form in forms]
-    arrays = {number: form for number, form in enumerate(forms, 1) if form.kind == "array"}
+    unpack_all = unpackers(message_type)
+    arrays = {number: form for number, form in enumerate(message_fields(message_type), 1) if form.kind == "array"}
 
     def decode(payload: bytes | memoryview, _sequence: int) -> Any:
         if len(payload) < _LARGE_BYTES or not arrays:
             parsed = parse(payload)
-            return message_type(*[unpack(parsed) for unpack in unpackers])
+            return message_type(*[unpack(parsed) for unpack in unpack_all])
         rest, found = cut_byte_fields(memoryview(payload), arrays)
         parsed, found = parse(rest), detach_fields(memoryview(payload), found)
         return message_type(
             *[
                 _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)
-                for number, unpack in enumerate(unpackers, 1)
+                for number, unpack in enumerate(unpack_all, 1)
             ]
         )
 
     return decode
 
 
-def _unpacker(form: MessageField) -> Callable[[Any], Any]:
-    """Takes the value of one field out of a parsed message."""
+def unpackers(message_type: type[Any], vector_of: Callable[[Any], Any] | None = None) -> list[Callable[[Any], Any]]:
+    """Functions that take the fields out of a parsed message; `vector_of` is used for vectors in place of arrays."""
+    return [_unpacker(form, vector_of or _vector) for form in message_fields(message_type)]
+
+
+def _unpacker(form: MessageField, vector_of: Callable[[Any], Any]) -> Callable[[Any], Any]:
     name, dtype = form.name, form.dtype
     present: Callable[[Any], Any] = operator.attrgetter(name)
     if form.kind == "vector":
 
         def present(parsed: Any) -> Any:
-            values = getattr(parsed, name)
-            count = len(values)
-            if _SHORT_VECTOR <= count <= _LONG_VECTOR:
-                return np.array(values, np.float64)
-            return np.fromiter(values, np.float64, count)
+            return vector_of(getattr(parsed, name))
 
     elif form.kind == "array":
 
@@ -268,6 +260,13 @@ def _unpacker(form: MessageField) -> Callable[[Any], Any]:
     if not form.optional:
         return present
     return lambda parsed: present(parsed) if parsed.HasField(name) else None
+
+
+def _vector(values: Any) -> NDArray[np.float64]:
+    count = len(values)
+    if _SHORT_VECTOR <= count <= _LONG_VECTOR:
+        return np.array(values, np.float64)
+    return np.fromiter(values, np.float64, count)
 
 
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:

@@ -23,7 +23,8 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
 
 from flowrec.core import SessionError, printable, seconds
 from flowrec.store.mcap_format import Record
@@ -93,12 +94,12 @@ class FileDigest:
     first: dict[int, tuple[int, int]] = field(default_factory=dict)  # by channel, session time in ns and chunk's offset
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
 
-    def add(self, offset: int, records: Iterable[Record]) -> None:
+    def add(self, place: ChunkIndex, records: Iterable[Record]) -> None:
         """Add the messages of one chunk."""
         for record in records:
             assert isinstance(record.payload, memoryview)
             self.counts[record.channel] += 1
-            self.last[record.channel] = at = (record.log_ns, offset)
+            self.last[record.channel] = at = (record.log_ns, place.chunk_start_offset)
             self.first.setdefault(record.channel, at)
             log_ns = record.log_ns + self.start_unix_ns
             self.sums[record.channel] += message_digest(record.sequence, log_ns, record.payload)
@@ -157,7 +158,7 @@ def _head_matches(file: SessionMetadata, recorded: str | None) -> bool:
             total += head_digest(Metadata(index.name, file.source.metadata(index)))
         for place in file.attachments:
             if is_header_file(place.name):
-                total += head_digest(file.source.attachment_at(place.offset, place.length))
+                total += head_digest(file.source.record(place.offset, place.length, Opcode.ATTACHMENT))
     except SessionError:  # damage, of which the reader says more
         return False
     return recorded == _text(total)
