@@ -84,7 +84,7 @@ def message_codec(message_type: type[Any], schema_name: str = "", bits: int = 8)
 
 def codec_of_extra(topic: Topic) -> Codec:
     """The codec of a topic that is no field of `Tick`: of its path, because packages may name types alike."""
-    return codec_of(topic.type) if topic.type in _OWN_TYPES else codec_of(topic.type, topic.path)
+    return codec_of(topic.type, "" if topic.type in _OWN_TYPES else topic.path)
 
 
 def _slots() -> Iterator[tuple[str, Slot]]:

@@ -70,17 +70,24 @@ class Codec:
     has_unix_time: bool = False
 
 
-@functools.cache
+_CODECS: dict[tuple[type[Any], str], Codec] = {}
+
+
 def codec_of(message_type: type[Any], path: str = "") -> Codec:
     """The codec of a message type other than Frame, which has several (frame_encodings.py); `path`: as of schema_of."""
-    if message_type is Frame:
-        raise TypeError("the codec of a Frame depends on its encoding")
-    if message_type is Event:
-        return _event_codec()
-    if message_type is OperatorEvent:
-        return _operator_codec()
-    schema = schema_of(message_type, path)
-    return Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
+    codec = _CODECS.get((message_type, path))
+    if codec is None:
+        if message_type is Frame:
+            raise TypeError("the codec of a Frame depends on its encoding")
+        if message_type is Event:
+            codec = _event_codec()
+        elif message_type is OperatorEvent:
+            codec = _operator_codec()
+        else:
+            schema = schema_of(message_type, path)
+            codec = Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
+        _CODECS[message_type, path] = codec
+    return codec
 
 
 def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> tuple[int | None, Payload]:

@@ -207,7 +207,7 @@ class _Bucket(ObjectRequests):
                         yield ListedObject(name, meta["size"], _version(meta))
 
 
-class _NoRangeError(Exception):
+class _NoRangeError(RefusedError):
     """The object has no bytes, of which no range can be had."""
 
 
@@ -225,7 +225,7 @@ def _bucket_errors() -> Iterator[None]:
     except (exceptions.BaseError, OSError, ValueError) as error:
         text = in_a_line(error)
         if "416" in text and "ange" in text:
-            raise _NoRangeError from error
+            raise _NoRangeError("has no bytes (416)") from error
         if "UnexpectedRange" in text:
             raise OtherRangeError("the server sends other bytes than those that are asked for") from error
         if "NotPartial" in text or "NoContentRange" in text:

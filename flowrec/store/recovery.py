@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flowrec.core import MCAP, Outcome, Output, OutputError, SessionError, hold_file, put_in_place, refuse_irregular
-from flowrec.store.audit import disagreements
+from flowrec.store.audit import disagreements, edits_of
 from flowrec.store.byte_source import on_this_machine
 from flowrec.store.channels import SessionContents
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
-from flowrec.store.digest import FileDigest
 from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.mcap_writer import disk_errors, new_mcap
@@ -227,9 +226,8 @@ def _verify(draft: Path) -> Recovered | None:
     try:
         with SessionReader(draft, file := FileReader(draft)) as reader:
             _ = file.header
-            digest = FileDigest(file.source.start_unix_ns)
-            scanned = scan(file.source, digest.add)
-            if scanned.lost_bytes or digest.faults(file) != [] or any(disagreements(file, scanned)):
+            scanned = scan(file.source, digests=True)
+            if scanned.lost_bytes or edits_of(file, scanned) != [] or any(disagreements(file, scanned)):
                 return None
             return Recovered(draft, reader.counts.get("track", 0), reader.duration_s)
     except SessionError:

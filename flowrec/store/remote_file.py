@@ -106,7 +106,7 @@ class RemoteFile:
     def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Ask for ranges (offset, length) that will be read soon; those near each other are one request."""
         with self._lock:
-            known = (self._object.head, self._object.tail, *self._ahead)
+            known: list[Answer | _Ahead] = [self._object.head, self._object.tail, *self._ahead]
             room = _AHEAD_BYTES - sum(each.end - each.first for each in self._ahead)
             joined: list[list[int]] = []
             for offset, length in sorted(ranges):

@@ -16,6 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from flowrec.core import SessionError
+from flowrec.store.digest import message_digest
 from flowrec.store.mcap_format import (
     CHUNK_HEAD,
     CHUNK_LIMIT_BYTES,
@@ -57,21 +58,25 @@ class Scan:
     lost_bytes : skipped before the end of the run; a missing or damaged index after it is no loss.
     first_lost : offset of the first of them.
     gaps : by channel.
-    last_ns : time of the last message, by channel.
     ended : the outcome of the run was found, which is written after its last message.
     counts : number of messages by channel.
+    first, last : time of the first and the last message in the file and offset of its chunk, by channel.
+    sums : of the digests of the messages, by channel, where they are wanted.
     chunks_passed : that were not read, because only the declarations were wanted.
     """
 
     _source: McapReader
-    _visit: Visit | None
+    _visit: Visit | None = None
+    _start_unix_ns: int | None = None  # as the index has it; None: no digests are wanted
     summary: Summary = field(default_factory=Summary)
     lost_bytes: int = 0
     first_lost: int = 0
     gaps: dict[int, list[SequenceGap]] = field(default_factory=dict)
-    last_ns: dict[int, int] = field(default_factory=dict)
     ended: bool = False
     counts: Counter[int] = field(default_factory=Counter)
+    first: dict[int, tuple[int, int]] = field(default_factory=dict)
+    last: dict[int, tuple[int, int]] = field(default_factory=dict)
+    sums: Counter[int] = field(default_factory=Counter)
     chunks_passed: int = 0
     _sequences: dict[int, int] = field(default_factory=dict)
 
@@ -128,13 +133,17 @@ class Scan:
         self.summary.chunks.append(place)
         if self._visit is not None:
             self._visit(place, records)
-        for log_ns, channel, sequence, _ in records:
+        for log_ns, channel, sequence, payload in records:
             missing = (sequence - self._sequences.get(channel, -1) - 1) % _SEQUENCES
             if missing:
                 self.gaps.setdefault(channel, []).append(SequenceGap(log_ns, missing))
             self._sequences[channel] = sequence
             self.counts[channel] += 1
-            self.last_ns[channel] = max(log_ns, self.last_ns.get(channel, 0))
+            self.last[channel] = at = (log_ns, offset)
+            self.first.setdefault(channel, at)
+            if self._start_unix_ns is not None:
+                assert isinstance(payload, memoryview)
+                self.sums[channel] += message_digest(sequence, log_ns + self._start_unix_ns, payload)
 
 
 def scan(
@@ -142,6 +151,7 @@ def scan(
     visit: Visit | None = None,
     progress: Callable[[int], None] | None = None,
     *,
+    digests: bool = False,
     heads_only: bool = False,
 ) -> Scan:
     """Read all of a file and index its intact records; one chunk is in memory at a time.
@@ -150,13 +160,14 @@ def scan(
     ----------
     visit : receives place and messages of every intact chunk, in file order.
     progress : receives the byte up to which the file has been read.
+    digests : sum up the digests of the messages.
     heads_only : pass over the content of chunks: only what is declared outside them is found.
 
     Raises
     ------
     SessionError : the file can not be read.
     """
-    found = Scan(source, visit)
+    found = Scan(source, visit, source.start_unix_ns if digests else None)
     at = len(MAGIC)
     # What looks like a chunk after damage may be none, and overlap the next one: the cost of trying is bounded.
     allowance_bytes = _TRIES * source.size + _WINDOW_BYTES

@@ -198,7 +198,7 @@ def test_a_run_that_waits_for_its_disk_is_never_more_than_flush_s_ahead_of_it(tm
             writer.write(tick)
             # As a kill would find it now.
             with contextlib.closing(McapReader(writer.partial_path)) as source:
-                held_ns = scan(source).last_ns.get(SLOTS["/robot/track"].channel, TICKS_BEGIN_NS)
+                held_ns = scan(source).last.get(SLOTS["/robot/track"].channel, (TICKS_BEGIN_NS,))[0]
             ahead_s.append(seconds(tick.stamp_ns - held_ns))
     assert 0.0 < max(ahead_s) <= 0.5
 
