@@ -62,7 +62,7 @@ class MessageIndexes:
         entries.extend((log_ns, at))  # as in a MessageIndex
         self._digests[channel] += message_digest(sequence, log_ns, payload)
 
-    def sealed(self) -> list[ChannelIndex]:
+    def channel_indexes(self) -> list[ChannelIndex]:
         """The indexes with their MessageIndex records; mcap's own records take 4 us for each message."""
         found = []
         for channel, entries in self._entries.items():
@@ -125,7 +125,7 @@ class ChunkBuilder:
             message_end_time=self._last_ns,
             uncompressed_crc=zlib.crc32(content),
             uncompressed_size=self.size,
-            indexes=self._indexes.sealed(),
+            indexes=self._indexes.channel_indexes(),
         )
         self.size, self._indexes = 0, MessageIndexes()
         if len(self._memory) > _REUSED_BYTES and self._compressor:

@@ -270,7 +270,7 @@ class ChunkCopier:
             message_end_time=place.message_end_time + start_unix_ns,
             uncompressed_crc=crc,
             uncompressed_size=at,
-            indexes=indexes.sealed(),
+            indexes=indexes.channel_indexes(),
         )
 
     def _rebuilt(self, place: ChunkIndex, kept: list[bool]) -> SealedChunk:

@@ -75,7 +75,7 @@ class FileReader(SessionContents):
             try:
                 row = decoders[record.channel](record)
             except SessionError as error:
-                raise self._damaged(record, error) from error
+                raise self._damage_error(record, error) from error
             yield record.log_ns, self.fields[record.channel], row
 
     def stamps(self, field: str) -> list[int]:
@@ -107,9 +107,9 @@ class FileReader(SessionContents):
         try:
             return self.decode(record)
         except SessionError as error:
-            raise self._damaged(record, error) from error
+            raise self._damage_error(record, error) from error
 
-    def _damaged(self, record: Record, error: SessionError) -> DamageError:
+    def _damage_error(self, record: Record, error: SessionError) -> DamageError:
         path = self.channels[record.channel].topic
         return DamageError(self.source.path, f"{path} at {record.log_ns} ns: {error}")
 

@@ -83,7 +83,7 @@ class ObjectRequests(ABC):
 
     @abstractmethod
     def _get(self, first: int | None, length: int, end_s: float) -> Answer:
-        """The same; OtherRangeError, with the size of the object, where it sends other bytes than the last ones."""
+        """Bytes as of `get`; OtherRangeError, with the size of the object, where the last ones are not to be had so."""
 
 
 def requests_for(url: str, timeout_s: float) -> ObjectRequests:

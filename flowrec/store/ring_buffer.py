@@ -187,8 +187,8 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             encoder.sequences = self._sequences
         return _RingSegment(encoder, dict(self._state), self._last_ns)
 
-    def _finished(self, file: SessionFile) -> None:
-        super()._finished(file)
+    def _note_finished(self, file: SessionFile) -> None:
+        super()._note_finished(file)
         self._remarks.append(f"{file.path}: whole, {file.size / 1e6:.1f} MB")
 
     def _is_full(self, stamp_ns: int) -> bool:

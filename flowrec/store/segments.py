@@ -201,13 +201,13 @@ class SegmentedRun(ABC, Generic[S]):
                 self._unfinished.remove(file)
                 try:
                     file.completion.result()
-                    self._finished(file)
+                    self._note_finished(file)
                 finally:
                     file.close()
         for file in self._growing:
             file.check()
 
-    def _finished(self, file: SessionFile) -> None:
+    def _note_finished(self, file: SessionFile) -> None:
         self.files.append(file.path)
         self._finished_bytes += file.size
 

@@ -219,7 +219,7 @@ class SessionMetadata:
         files = {index.name: self.source.attachment(index) for index in wanted}
         records = self._records()
 
-        def named(prefix: str) -> dict[str, bytes]:
+        def files_with(prefix: str) -> dict[str, bytes]:
             return {name.removeprefix(prefix): data for name, data in files.items() if name.startswith(prefix)}
 
         try:
@@ -229,10 +229,10 @@ class SessionMetadata:
                 chip_toml=files[CHIP_FILE].decode(),
                 provenance=records[PROVENANCE],
                 parent=records.get(PARENT, {}),
-                weights=named(_WEIGHTS),
+                weights=files_with(_WEIGHTS),
                 part=self.part,
                 start_unix_ns=self.source.start_unix_ns,
-                pictures=named(_PICTURES),
+                pictures=files_with(_PICTURES),
             )
         except KeyError as error:
             raise self.source.damage_error(0, f"the record {error} is missing") from error
