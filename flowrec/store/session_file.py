@@ -177,7 +177,6 @@ class SessionFile:
         self._writing: Future[None] | None = None  # the last of these
         self._syncing: Future[None] | None = None
         self._name_synced = False
-        self._flushed_s = self._synced_s = options.clock()
         self._synced_size = 0
         self._since_ns: int | None = None  # stamp of the last flush, or of the first entry
         self._last_ns = 0
@@ -190,6 +189,7 @@ class SessionFile:
             if isinstance(error, OSError):
                 raise not_writable(self.partial_path, error) from error
             raise
+        self._flushed_s = self._synced_s = options.clock()
 
     def _write_head(self, header: SessionHeader) -> None:
         options = self._options
