@@ -9,7 +9,6 @@ from pathlib import Path
 
 from flowrec.core import MCAP, Outcome, Output, OutputError, SessionError, hold_file, put_in_place, refuse_irregular
 from flowrec.store.audit import disagreements, edits_of
-from flowrec.store.byte_source import on_this_machine
 from flowrec.store.channels import SessionContents
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
 from flowrec.store.file_reader import FileReader
@@ -35,6 +34,7 @@ from flowrec.store.session_metadata import (
     SESSION,
     Part,
 )
+from flowrec.store.session_path import on_this_machine
 from flowrec.store.writer import SessionWriter
 
 _REMAINS_SUFFIX = ".remains"
