@@ -8,18 +8,19 @@ from .mcap_reader import ForeignError as ForeignError
 from .notes import NOTES_SUFFIX as NOTES_SUFFIX, Note as Note, notes_content as notes_content, notes_file as notes_file
 from .reader import SessionReader as SessionReader
 from .recovery import Recovered as Recovered, recover as recover, recover_run as recover_run
-from .remote_file import RemoteFile as RemoteFile, forget as forget
-from .remote_folder import files_at as files_at, is_listed as is_listed, objects_in as objects_in
+from .remote_file import (
+    RemoteFile as RemoteFile, files_at as files_at, forget as forget, is_listed as is_listed,
+    objects_in as objects_in,
+)
 from .roi import nonzero_window as nonzero_window
 from .run_files import (
     PARTIAL_SUFFIX as PARTIAL_SUFFIX, Run as Run, SESSION_SUFFIX as SESSION_SUFFIX,
-    continuity_fault as continuity_fault, files_of as files_of, is_continued as is_continued,
-    is_snapshot as is_snapshot, part_number as part_number, part_path as part_path, run_files as run_files,
-    run_path as run_path, runs_in as runs_in,
+    continuity_fault as continuity_fault, files_behind as files_behind, files_of as files_of,
+    is_continued as is_continued, is_snapshot as is_snapshot, part_number as part_number, part_path as part_path,
+    run_files as run_files, run_path as run_path, runs_in as runs_in, session_sha256 as session_sha256,
 )
 from .session import (
-    Session as Session, files_behind as files_behind, input_blamed as input_blamed, open as open,
-    session_sha256 as session_sha256, toml_table as toml_table,
+    Session as Session, input_blamed as input_blamed, open as open, toml_table as toml_table,
 )
 from .session_file import WriterOptions as WriterOptions
 from .session_metadata import (
@@ -34,9 +35,8 @@ from .session_writer import (
     frames_of as frames_of, image_bytes_s as image_bytes_s, session_header as session_header,
     session_writer as session_writer,
 )
-from .tables.columns import columns_of as columns_of
-from .tables.field_tables import field_values as field_values, observed_flow as observed_flow
-from .tables.observed import observations_of as observations_of
+from .table_columns import columns_of as columns_of, observations_of as observations_of
+from .tables import field_values as field_values, observed_flow as observed_flow
 from .traffic import (
     HiddenError as HiddenError, MissingError as MissingError, RefusedError as RefusedError,
     TIMEOUT_KEY as TIMEOUT_KEY, TRAFFIC as TRAFFIC, TransientError as TransientError,

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.records import ChunkIndex
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, Metadata
 
-from flowrec.core import FIXED, Message, SessionError, TopicTable, seconds, shape_error
+from flowrec.core import FIXED, Message, SessionError, TopicTable, printable, seconds
 from flowrec.store.channels import SessionContents
-from flowrec.store.digest import FileDigest
+from flowrec.store.digest import HEAD, channel_digest, head_digest, sum_text, topic_text
 from flowrec.store.mcap_format import Record
 from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
 from flowrec.store.roi import Region
 from flowrec.store.run_files import RunFile, files_of
 from flowrec.store.scan import Scan, scan
-from flowrec.store.session_metadata import SessionHeader, SessionMetadata
+from flowrec.store.session_metadata import SessionHeader, SessionMetadata, is_header_file
+
+_FAULTS_LIMIT, _TEXT_LIMIT = 40, 200  # a made-up file may name any number of topics
 
 See = Callable[[str, int, Message], None]  # field of Tick, time of the tick in ns, message
 
@@ -83,8 +87,7 @@ class Audit:
         """The file as run_files.py compares it with others."""
         part = self.header.part if self.header is not None else None
         counts = {self.topics.by_field[name].path: count for name, count in self.counts.items()}
-        version, size_bytes = self.flowrec_version, self.size_bytes
-        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, version, size_bytes)
+        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.size_bytes)
 
 
 def audit(
@@ -109,7 +112,8 @@ def audit(
         contents = SessionContents(path)
         found = Audit(path, contents.source.size)
     except (UnfinishedError, DamageError) as error:
-        contents = _contents_without_index(path)
+        with contextlib.closing(McapReader(path)) as source:
+            contents = SessionContents(path, scan(source).summary)
         found = Audit(path, contents.source.size, finished=False)
         found.why_not = error.what if isinstance(error, DamageError) else _first_part(error, path)
     with contents:
@@ -122,14 +126,14 @@ def audit(
         if begin is not None:
             begin(found)
         reading = _ChunkAudit(found, contents, see)
-        scanned = scan(contents.source, reading.take, progress)
+        scanned = scan(contents.source, reading.take, progress, digests=found.finished)
         found.lost, found.first_lost = scanned.lost_bytes, scanned.first_lost
         for channel, name in contents.fields.items():
             if name != "frame" and channel in scanned.gaps:  # the camera numbers the images
                 gaps = [gap for gap in scanned.gaps[channel] if gap.before_ns > found.first_ns]
                 found.missing[name] += sum(gap.messages for gap in gaps)
         if found.finished:
-            found.edits = reading.digest.faults(contents)
+            found.edits = edits_of(contents, scanned)
             for fatal, text in disagreements(contents, scanned):
                 (found.contradictions if fatal else found.disagreements).append(text)
     return found
@@ -145,10 +149,8 @@ def digest_faults(path: Path) -> dict[Path, list[str] | None]:
     found: dict[Path, list[str] | None] = {}
     for file in files_of(path):
         with SessionMetadata(file) as metadata:
-            digest = FileDigest(metadata.source.start_unix_ns)
-            if metadata.digest is not None:
-                scan(metadata.source, digest.add)
-            found[file] = digest.faults(metadata)
+            scanned = scan(metadata.source, digests=True) if metadata.digest is not None else Scan(metadata.source)
+            found[file] = edits_of(metadata, scanned)
     return found
 
 
@@ -158,49 +160,32 @@ class _ChunkAudit:
     def __init__(self, found: Audit, contents: SessionContents, see: See) -> None:
         self._found = found
         self._contents = contents
-        self.digest = FileDigest(contents.source.start_unix_ns)
         self._see = see
         self._last_ns: dict[str, int] = {}
         self._last_stamp_ns: dict[str, int] = {}
-        self._any = False
 
-    def take(self, offset: int, records: list[Record]) -> None:
+    def take(self, place: ChunkIndex, records: list[Record]) -> None:
         found = self._found
-        self.digest.add(offset, records)
         for record in records:
             name = self._contents.fields.get(record.channel)
             if name is None:
                 continue
-            found.counts[name] += 1
-            found.first_ns = min(found.first_ns, record.log_ns) if self._any else record.log_ns
+            found.first_ns = min(found.first_ns, record.log_ns) if found.counts else record.log_ns
             found.last_ns = max(found.last_ns, record.log_ns)
-            self._any = True
+            found.counts[name] += 1
             found.backwards[name] += record.log_ns < self._last_ns.get(name, record.log_ns)
             self._last_ns[name] = record.log_ns
             try:
                 message = self._contents.decode(record)
-                wrong = shape_error(message)
             except SessionError as error:
-                wrong = str(error)
-            if wrong:
                 found.undecodable[name] += 1
-                fault = f"{found.topics.by_field[name].path} in the chunk at byte {offset}: {wrong}"
-                found.first_undecodable = found.first_undecodable or fault
+                path, offset = found.topics.by_field[name].path, place.chunk_start_offset
+                found.first_undecodable = found.first_undecodable or f"{path} in the chunk at byte {offset}: {error}"
                 continue
             stamp_ns = message.stamp_ns
             found.stamps_backwards[name] += stamp_ns < self._last_stamp_ns.get(name, stamp_ns)
             self._last_stamp_ns[name] = stamp_ns
             self._see(name, record.log_ns, message)
-
-
-def _contents_without_index(path: Path) -> SessionContents:
-    """The contents of a file whose index is missing or damaged, by a scan."""
-    source = McapReader(path)
-    try:
-        found = scan(source)
-    finally:
-        source.close()
-    return SessionContents(path, found.summary)
 
 
 def disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool, str]]:
@@ -248,3 +233,64 @@ def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:
 
 def _first_part(error: SessionError, path: Path) -> str:
     return str(error).removeprefix(f"{path}: ").split("; ")[0]
+
+
+def edits_of(file: SessionMetadata, found: Scan) -> list[str] | None:
+    """Differences of a finished file from the digest that it contains, by a scan with `digests`; None: it has none.
+
+    Topics and records that flowrec has not written are passed over.
+    """
+    recorded = file.digest
+    if recorded is None:
+        # Files of the first release have neither a digest nor a start.
+        return ["the digest, which was taken out"] if file.source.start_unix_ns and file.outcome else None
+    counts: Counter[str] = Counter()
+    sums: Counter[str] = Counter()
+    declared: dict[str, set[str]] = {}
+    ours: set[str] = set()
+    for number, channel in file.channels.items():
+        counts[channel.topic] += found.counts[number]
+        sums[channel.topic] += found.sums[number]
+        if found.counts[number]:  # other programs leave out channels without a message
+            of_channel = channel_digest(channel, file.schemas.get(channel.schema_id))
+            declared.setdefault(channel.topic, set()).add(of_channel)
+        if "role" in channel.metadata:  # flowrec has declared it
+            ours.add(channel.topic)
+    faults = []
+    if not _head_matches(file, recorded.get(HEAD)):
+        faults.append("the head (configuration, chip, origin or outcome)")
+    for topic in sorted((recorded.keys() | {topic for topic in ours if counts[topic]}) - {HEAD}):
+        expected, read = recorded.get(topic, "0").split(" "), topic_text(counts[topic], sums[topic]).split(" ")
+        if declared.get(topic, set()) - set(expected[2:]) and expected[2:]:
+            faults.append(printable(f"{topic[:_TEXT_LIMIT]}, in its schema or metadata"))
+        if read == expected[:2]:
+            continue
+        numbers = f", {read[0]} where {expected[0][:_TEXT_LIMIT]} were" if expected[0] != read[0] else ""
+        here = {number for number, channel in file.channels.items() if channel.topic == topic}
+        faults.append(printable(f"{topic[:_TEXT_LIMIT]}, in its messages{numbers}{_extent(found, here)}"))
+    more = len(faults) - _FAULTS_LIMIT
+    return faults if more <= 0 else [*faults[:_FAULTS_LIMIT], f"and so on, {more} more"]
+
+
+def _extent(found: Scan, channels: set[int]) -> str:
+    """From when to when, and in which bytes of the file, the messages of some channels are; '' without one."""
+    ends = [found.first[number] for number in channels & found.first.keys()]
+    ends += [found.last[number] for number in channels & found.last.keys()]
+    if not ends:
+        return ""
+    times, offsets = [seconds(at_ns) for at_ns, _ in ends], [offset for _, offset in ends]
+    place = f"byte {min(offsets)}" if len(set(offsets)) == 1 else f"bytes {min(offsets)} to {max(offsets)}"
+    return f" ({min(times):.3f} to {max(times):.3f} s, chunks at {place})"
+
+
+def _head_matches(file: SessionMetadata, recorded: str | None) -> bool:
+    total = 0
+    try:
+        for index in file.metadata:
+            total += head_digest(Metadata(index.name, file.source.metadata(index)))
+        for place in file.attachments:
+            if is_header_file(place.name):
+                total += head_digest(file.source.record(place.offset, place.length, Opcode.ATTACHMENT))
+    except SessionError:  # damage, of which the reader says more
+        return False
+    return recorded == sum_text(total)

@@ -13,7 +13,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -74,6 +74,10 @@ class Sent:
 class LocalParts:
     """A file, in the parts in which it is sent.
 
+    Attributes
+    ----------
+    content : of the file, once `read_all` has come to its end.
+
     Raises
     ------
     SessionError : it can not be read, or changes while it is read.
@@ -102,6 +106,17 @@ class LocalParts:
             raise SessionError(f"{self.path}: changes while it is sent; push it when it is finished")
         return data
 
+    def read_all(self) -> Iterator[tuple[int, bytes, bytes]]:
+        """Number, bytes and MD5 of each part, in order."""
+        sha256, md5s = hashlib.sha256(), list[bytes]()
+        for number in range(1, self.count + 1):
+            data = self.read(number)
+            sha256.update(data)
+            md5s.append(_md5(data))
+            yield number, data, md5s[-1]
+        etag = md5s[0].hex() if len(md5s) == 1 else f"{_md5(b''.join(md5s)).hex()}-{len(md5s)}"
+        self.content = Content(self.size, sha256.hexdigest(), etag)
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -114,38 +129,12 @@ class LocalParts:
             raise SessionError(f"{self.path}: can not be read ({error.strerror or error})") from error
 
 
-class _Hashes:
-    """Hashes of a file whose parts are added in order."""
-
-    def __init__(self) -> None:
-        self._sha256 = hashlib.sha256()
-        self._parts: list[bytes] = []
-        self._size = 0
-
-    def add(self, data: bytes) -> bytes:
-        """The MD5 of a part."""
-        self._size += len(data)
-        self._sha256.update(data)
-        self._parts.append(_md5(data))
-        return self._parts[-1]
-
-    @property
-    def content(self) -> Content:
-        parts = self._parts
-        etag = parts[0].hex() if len(parts) == 1 else f"{_md5(b''.join(parts)).hex()}-{len(parts)}"
-        return Content(self._size, self._sha256.hexdigest(), etag)
-
-
 def content_of_file(path: Path, progress: Callable[[int], None] = lambda _: None) -> Content:
     """Size and hashes of a file; `progress` takes the bytes that have been read. SessionError if it can not be read."""
-    parts, hashes = LocalParts(path), _Hashes()
-    try:
-        for number in range(1, parts.count + 1):
-            hashes.add(parts.read(number))
+    with closing(LocalParts(path)) as parts:
+        for number, _, _ in parts.read_all():
             progress(min(number * parts.part_bytes, parts.size))
-    finally:
-        parts.close()
-    return hashes.content
+        return parts.content
 
 
 class Bucket:
@@ -188,17 +177,13 @@ class Bucket:
         ----------
         progress : takes the bytes of the file that the bucket has.
         """
-        parts = LocalParts(path)
-        try:
-            if parts.count == 1:
-                hashes, data = _Hashes(), parts.read(1)
-                hashes.add(data)
-                etag = self.put(name, data)
-                progress(parts.size)
-                return None if etag is None else Sent(hashes.content, parts.size, etag)
-            return _Upload(partial(self._ask, name), self._key(name), parts).run(progress)
-        finally:
-            parts.close()
+        with closing(LocalParts(path)) as parts:
+            if parts.count > 1:
+                return _Upload(partial(self._ask, name), self._key(name), parts).run(progress)
+            ((_, data, _),) = parts.read_all()
+            etag = self.put(name, data)
+            progress(parts.size)
+            return None if etag is None else Sent(parts.content, parts.size, etag)
 
     def _key(self, name: str) -> str:
         return f"{self._prefix}/{name}".lstrip("/")
@@ -239,13 +224,10 @@ class _Upload:
 
     def run(self, progress: Callable[[int], None]) -> Sent | None:
         """Send what is missing and make the object; None if there is one of that name by now."""
-        upload_id = self._find_interrupted() or self._begin_upload()
-        hashes = _Hashes()
+        upload_id: str = self._find_interrupted() or self._ask("create_multipart_upload")["UploadId"]
         threads = ThreadPoolExecutor(_TOGETHER, "upload")
         try:
-            for number in range(1, self._parts.count + 1):
-                data = self._parts.read(number)
-                md5 = hashes.add(data)
+            for number, data, md5 in self._parts.read_all():
                 if self._there.get(number) == md5.hex():
                     self._done_bytes += len(data)
                     progress(self._done_bytes)
@@ -253,7 +235,6 @@ class _Upload:
                 while len(self._sending) >= _TOGETHER:
                     self._wait(progress)
                 self._sending[threads.submit(self._send, upload_id, number, data, md5)] = len(data)
-                del data
             while self._sending:
                 self._wait(progress)
         finally:
@@ -269,12 +250,7 @@ class _Upload:
         if made is None:
             self._ask("abort_multipart_upload", UploadId=upload_id)
             return None
-        return Sent(hashes.content, self._sent_bytes, _etag(made))
-
-    def _begin_upload(self) -> str:
-        self._there.clear()
-        upload_id: str = self._ask("create_multipart_upload")["UploadId"]
-        return upload_id
+        return Sent(self._parts.content, self._sent_bytes, _etag(made))
 
     def _find_interrupted(self) -> str | None:
         """An interrupted upload of this file: one of its name, whose first part holds the same."""
@@ -343,7 +319,9 @@ def _ours(error: Exception) -> Exception | None:
         found = of_status(status)
         if status == NOT_OFFERED:
             return RefusedError(f"can not be written: the store does not offer what push needs ({status} {code[:60]})")
-        return found if type(found) is not RefusedError else RefusedError(f"the server answers {status} {code[:60]}")
+        if isinstance(found, RefusedError) and found.kind is SessionError:
+            return RefusedError(f"the server answers {status} {code[:60]}")
+        return found
     if isinstance(error, exceptions.NoCredentialsError | exceptions.PartialCredentialsError):
         return RefusedError("can not be written: there are no credentials in the environment")
     if isinstance(error, exceptions.ReadTimeoutError | exceptions.ConnectTimeoutError):

@@ -1,7 +1,4 @@
-"""Sources of the bytes of a session. mcap_reader.py reads byte ranges from one of them.
-
-Another kind (an archive) is one class and one row of BYTE_SOURCES.
-"""
+"""Sources of the bytes of a session. mcap_reader.py reads byte ranges from one of them."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import os
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -100,16 +97,6 @@ class LocalFile:
         self._closer()
 
 
-def _remote_file(path: Path) -> ByteSource:
-    from flowrec.store.remote_file import RemoteFile
-
-    return RemoteFile(path)
-
-
-# By the kind of path that session_path.py makes.
-BYTE_SOURCES: Mapping[type[Path], Callable[[Path], ByteSource]] = {UrlPath: _remote_file}
-
-
 def open_bytes(path: Path) -> ByteSource:
     """The bytes that a path or URL names.
 
@@ -117,7 +104,11 @@ def open_bytes(path: Path) -> ByteSource:
     ------
     SessionError : they can not be opened.
     """
-    return BYTE_SOURCES.get(type(path), LocalFile)(path)
+    if not isinstance(path, UrlPath):
+        return LocalFile(path)
+    from flowrec.store.remote_file import RemoteFile
+
+    return RemoteFile(path)
 
 
 def is_there(path: Path) -> bool:

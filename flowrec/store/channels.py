@@ -8,7 +8,7 @@ neither images nor previews. Channel numbers depend on the tables only: the same
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 from google.protobuf import descriptor_pb2
 from mcap.records import Channel
 from mcap.records import Schema as SchemaRecord
+from numpy.typing import NDArray
 
 from flowrec.core import (
     BY_FIELD,
@@ -29,11 +30,15 @@ from flowrec.core import (
     TopicTable,
     UsageError,
     __version__,
+    array_shapes,
     declaration,
     declared_topic,
     defaulted_fields,
+    message_fields,
+    shape_error,
+    shape_fault,
 )
-from flowrec.store.codec import Codec, codec_of, decode
+from flowrec.store.codec import Codec, codec_of, decode, unpackers
 from flowrec.store.frame_encodings import FrameEncoding, frame_codec
 from flowrec.store.mcap_format import Record, Summary
 from flowrec.store.roi import Region, region_from
@@ -44,6 +49,10 @@ from flowrec.store.viewer_topics import VIEWER_TOPICS
 FRAMES, STATE, VIEW = "frames", "state", "view"
 GROUPS = (FRAMES, STATE, VIEW)
 FRAME_PATH = BY_FIELD["frame"].path
+
+# The values of a message in order of its fields: int, float, bool, str, tuple for a vector, array, or None.
+Row = tuple[Any, ...]
+_SMALL_BYTES = 1 << 14  # of a payload that is parsed as a whole
 
 _OWN_TYPES = frozenset(topic.type for topic in TOPICS)
 _DECLARATION = "declaration"  # in the metadata of the channel of an extra topic
@@ -212,7 +221,45 @@ class SessionContents(SessionMetadata):
         """
         kind = self.topics.by_field[self.fields[record.channel]].type
         assert isinstance(record.payload, memoryview)
-        return decode(kind, self.codecs[record.channel], record.payload, record.sequence, self.source.start_unix_ns)
+        codec, start_unix_ns = self.codecs[record.channel], self.source.start_unix_ns
+        message = decode(kind, codec, record.payload, record.sequence, start_unix_ns)
+        if fault := shape_error(message):
+            raise SessionError(fault)
+        return message
+
+    def row_decoder(self, channel: int) -> Callable[[Record], Row]:
+        """Function from a record of a channel, not of images, to its row; it raises SessionError for a damaged record.
+
+        It takes a fifth of the time that messages with their arrays take.
+        """
+        kind: Any = self.topics.by_field[self.fields[channel]].type
+        codec = self.codecs[channel]
+        names = [each.name for each in message_fields(kind)]
+
+        def whole(record: Record) -> Row:
+            message = self.decode(record)
+            return tuple(getattr(message, name) for name in names)
+
+        if codec.has_unix_time:
+            return whole
+        parse = codec.schema.wire.FromString
+        unpack_all = unpackers(kind, tuple)  # no lists, which the garbage collector visits again and again
+        arrays = {name: names.index(name) for name, _ in array_shapes(kind)}
+
+        def small(record: Record) -> Row:
+            payload = record.payload
+            if len(payload) > _SMALL_BYTES:  # type: ignore[arg-type]  # a memoryview here
+                return whole(record)
+            try:
+                parsed = parse(payload)
+                row = tuple([unpack(parsed) for unpack in unpack_all])
+            except Exception:  # noqa: BLE001 - the careful decoder says what is wrong with it, as for every reader
+                return whole(record)
+            if arrays and (fault := shape_fault(kind, lambda name: _shape(row[arrays[name]]))):
+                raise SessionError(fault)
+            return row
+
+        return small
 
     def _check_schema(self, channel_number: int) -> None:
         channel = self.channels[channel_number]
@@ -241,6 +288,12 @@ class SessionContents(SessionMetadata):
             f"{self.source.path}: {channel.topic} has another schema ({', '.join(differs)});"
             f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
         )
+
+
+def _shape(value: tuple[float, ...] | NDArray[Any] | None) -> tuple[int, ...] | None:
+    if value is None:
+        return None
+    return (len(value),) if isinstance(value, tuple) else value.shape
 
 
 def bits_from(metadata: Mapping[str, str]) -> int:

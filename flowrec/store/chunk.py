@@ -47,6 +47,32 @@ def copy_chunks(chunks: Iterable[SealedChunk]) -> list[SealedChunk]:
     return [replace(chunk, data=bytes(chunk.data)) for chunk in chunks]
 
 
+class MessageIndexes:
+    """Places and digests of the messages of a chunk, by channel; all times are those in the file."""
+
+    def __init__(self) -> None:
+        self._entries: dict[int, array[int]] = {}
+        self._digests: Counter[int] = Counter()
+
+    def add(self, channel: int, sequence: int, log_ns: int, at: int, payload: memoryview) -> None:
+        """Enter a message that begins at a byte of the content."""
+        entries = self._entries.get(channel)
+        if entries is None:
+            entries = self._entries[channel] = array("Q")
+        entries.extend((log_ns, at))  # as in a MessageIndex
+        self._digests[channel] += message_digest(sequence, log_ns, payload)
+
+    def channel_indexes(self) -> list[ChannelIndex]:
+        """The indexes with their MessageIndex records; mcap's own records take 4 us for each message."""
+        found = []
+        for channel, entries in self._entries.items():
+            data = np.array(entries, "<u8").tobytes()
+            body = _INDEX_HEAD.pack(channel, len(data)) + data
+            record = RECORD_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body
+            found.append(ChannelIndex(channel, len(entries) // 2, self._digests[channel], record))
+        return found
+
+
 class ChunkBuilder:
     """Collects messages in order of time; `seal` empties it.
 
@@ -60,8 +86,7 @@ class ChunkBuilder:
     def __init__(self, *, compressed: bool = True) -> None:
         self.size = 0  # bytes before compression
         self._memory = bytearray(_MEMORY_BYTES)
-        self._index: dict[int, array[int]] = {}
-        self._digests: Counter[int] = Counter()
+        self._indexes = MessageIndexes()
         self._first_ns = self._last_ns = 0
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL) if compressed else None
 
@@ -70,10 +95,6 @@ class ChunkBuilder:
         if not self.size:
             self._first_ns = log_ns
         self._last_ns = log_ns
-        index = self._index.get(channel)
-        if index is None:
-            index = self._index[channel] = array("Q")
-        index.extend((log_ns, self.size))  # as in a MessageIndex
         body_at = self.size + RECORD_HEAD.size
         payload_at = body_at + MESSAGE_HEAD.size
         end = payload_at + sum(map(len, payload))
@@ -91,7 +112,7 @@ class ChunkBuilder:
             else:
                 np.copyto(np.frombuffer(self._memory, np.uint8, len(part), at), np.frombuffer(part, np.uint8))
             at += len(part)
-        self._digests[channel] += message_digest(sequence, log_ns, memoryview(self._memory)[payload_at:end])
+        self._indexes.add(channel, sequence, log_ns, self.size, memoryview(self._memory)[payload_at:end])
         self.size = end
 
     def seal(self) -> SealedChunk:
@@ -104,22 +125,12 @@ class ChunkBuilder:
             message_end_time=self._last_ns,
             uncompressed_crc=zlib.crc32(content),
             uncompressed_size=self.size,
-            indexes=[
-                ChannelIndex(channel, len(entries) // 2, self._digests[channel], index_record(channel, entries))
-                for channel, entries in self._index.items()
-            ],
+            indexes=self._indexes.channel_indexes(),
         )
-        self.size, self._index, self._digests = 0, {}, Counter()
+        self.size, self._indexes = 0, MessageIndexes()
         if len(self._memory) > _REUSED_BYTES and self._compressor:
             self._memory = bytearray(_MEMORY_BYTES)  # a flow field comes once a minute
         return chunk
-
-
-def index_record(channel: int, entries: array[int]) -> bytes:
-    """An MCAP MessageIndex of times and places by turns; mcap's own takes 4 us for each message."""
-    data = np.array(entries, "<u8").tobytes()
-    body = _INDEX_HEAD.pack(channel, len(data)) + data
-    return RECORD_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body
 
 
 class ChunkEncoder:

@@ -226,38 +226,37 @@ def _large_array(number: int, array: NDArray[Any]) -> Payload:
 
 def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memoryview, int], Any]:
     parse = schema.wire.FromString
-    forms = message_fields(message_type)
-    unpackers = [_unpacker(form) for form in forms]
-    arrays = {number: form for number, form in enumerate(forms, 1) if form.kind == "array"}
+    unpack_all = unpackers(message_type)
+    arrays = {number: form for number, form in enumerate(message_fields(message_type), 1) if form.kind == "array"}
 
     def decode(payload: bytes | memoryview, _sequence: int) -> Any:
         if len(payload) < _LARGE_BYTES or not arrays:
             parsed = parse(payload)
-            return message_type(*[unpack(parsed) for unpack in unpackers])
+            return message_type(*[unpack(parsed) for unpack in unpack_all])
         rest, found = cut_byte_fields(memoryview(payload), arrays)
         parsed, found = parse(rest), detach_fields(memoryview(payload), found)
         return message_type(
             *[
                 _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)
-                for number, unpack in enumerate(unpackers, 1)
+                for number, unpack in enumerate(unpack_all, 1)
             ]
         )
 
     return decode
 
 
-def _unpacker(form: MessageField) -> Callable[[Any], Any]:
-    """Takes the value of one field out of a parsed message."""
+def unpackers(message_type: type[Any], vector_of: Callable[[Any], Any] | None = None) -> list[Callable[[Any], Any]]:
+    """Functions that take the fields out of a parsed message; `vector_of` is used for vectors in place of arrays."""
+    return [_unpacker(form, vector_of or _vector) for form in message_fields(message_type)]
+
+
+def _unpacker(form: MessageField, vector_of: Callable[[Any], Any]) -> Callable[[Any], Any]:
     name, dtype = form.name, form.dtype
     present: Callable[[Any], Any] = operator.attrgetter(name)
     if form.kind == "vector":
 
         def present(parsed: Any) -> Any:
-            values = getattr(parsed, name)
-            count = len(values)
-            if _SHORT_VECTOR <= count <= _LONG_VECTOR:
-                return np.array(values, np.float64)
-            return np.fromiter(values, np.float64, count)
+            return vector_of(getattr(parsed, name))
 
     elif form.kind == "array":
 
@@ -268,6 +267,13 @@ def _unpacker(form: MessageField) -> Callable[[Any], Any]:
     if not form.optional:
         return present
     return lambda parsed: present(parsed) if parsed.HasField(name) else None
+
+
+def _vector(values: Any) -> NDArray[np.float64]:
+    count = len(values)
+    if _SHORT_VECTOR <= count <= _LONG_VECTOR:
+        return np.array(values, np.float64)
+    return np.fromiter(values, np.float64, count)
 
 
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:

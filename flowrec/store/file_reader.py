@@ -14,12 +14,11 @@ from typing import Any
 
 from mcap.records import ChunkIndex
 
-from flowrec.core import Frame, Message, SessionError, pixel_type, shape_error
-from flowrec.store.channels import SessionContents
+from flowrec.core import Frame, Message, SessionError, pixel_type
+from flowrec.store.channels import Row, SessionContents
 from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
-from flowrec.store.rows import Row, row_decoder
 from flowrec.store.write_queue import NewMessages
 
 Cache = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
@@ -38,92 +37,57 @@ _ChunkContent = bytes | memoryview | list[Record]
 _by_time = attrgetter("log_ns")
 
 
-class FileReader:
+class FileReader(SessionContents):
     """A finished file, open for reading; several iterations may run at a time.
 
     Parameters
     ----------
-    path : the file.
-    contents : its index, where the file has none or a wrong one (recovery.py).
-    skip : receives the fault of each message that can not be decoded, which is then left out; None: it is
-        an error.
     cache : restored messages, shared by the files of a run.
-
-    Attributes
-    ----------
-    path : the file.
-    contents : its index.
-
-    Raises
-    ------
-    SessionError : there is no such file, or it is no session that this flowrec can read; on reading, damage.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        contents: SessionContents | None = None,
-        skip: Callable[[str], None] | None = None,
-        cache: Cache | None = None,
-    ) -> None:
-        self.path = path
-        self._skip = skip
-        self.contents = contents if contents is not None else SessionContents(path)
-        self._source = self.contents.source
-        self._fields = self.contents.fields
+    def __init__(self, path: Path, cache: Cache | None = None) -> None:
+        super().__init__(path)
         self._cache: Cache = cache if cache is not None else {}
         self._frame_channels = self._channels_of({"frame"})
-        encoding = ENCODINGS.get(self.contents.frame_encoding)
+        encoding = ENCODINGS.get(self.frame_encoding)
         self._lossless = encoding is None or encoding.lossless
 
     def new_messages(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, NewMessages]]:
         """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
-        size = _StateSize(self.path)
-        for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=_by_time):
+        size = _StateSize(self.source.path)
+        for stamp_ns, records in itertools.groupby(self._records_from(start_ns, with_frames), key=_by_time):
             new: NewMessages = {}
             for record in records:
-                field = self._fields[record.channel]
+                field = self.fields[record.channel]
                 size.add(field, record)
-                message = self._message(record)
-                if message is not None:
-                    new[field] = message
-            if new:
-                yield stamp_ns, new
+                new[field] = self._message(record)
+            yield stamp_ns, new
 
     def messages(self, field: str) -> Iterator[tuple[int, Any]]:
         """All messages of one topic, each with the stamp of its tick."""
-        channels = self._channels_of({field})
-        with _threads() as executor:
-            for record in _merge(self._source, self._chunks_with(channels), executor, self._decoded_frame):
-                if record.channel in channels:
-                    message = self._message(record)
-                    if message is not None:
-                        yield record.log_ns, message
+        for record in self._records_of(self._channels_of({field}), self._decoded_frame):
+            yield record.log_ns, self._message(record)
 
     def rows(self, fields: Collection[str]) -> Iterator[tuple[int, str, Row]]:
-        """Stamp of the tick, field of Tick and row of plain values (see rows.py) of each message of some topics."""
-        channels = self._channels_of(fields)
-        decoders = {channel: row_decoder(self.contents, channel) for channel in channels}
-        with _threads() as executor:
-            for record in _merge(self._source, self._chunks_with(channels), executor):
-                if record.channel in channels:
-                    try:
-                        row = decoders[record.channel](record)
-                    except SessionError as error:
-                        path = self.contents.channels[record.channel].topic
-                        raise DamageError(self.path, f"{path} at {record.log_ns} ns: {error}") from error
-                    yield record.log_ns, self._fields[record.channel], row
+        """Stamp of the tick, field of Tick and row of plain values of each message of some topics."""
+        decoders = {channel: self.row_decoder(channel) for channel in self._channels_of(fields)}
+        for record in self._records_of(set(decoders)):
+            try:
+                row = decoders[record.channel](record)
+            except SessionError as error:
+                raise self._damage_error(record, error) from error
+            yield record.log_ns, self.fields[record.channel], row
 
     def stamps(self, field: str) -> list[int]:
         """The stamps of the ticks with a message of a topic, in order, from the index of the file where it has one."""
         found: list[int] = []
         for channel in self._channels_of({field}):
             chunks = self._chunks_with({channel})
-            self._source.prefetch(chunks, indexes=True)
+            self.source.prefetch(chunks, indexes=True)
             for chunk in chunks:
-                times = self._source.message_times(chunk, channel)
+                times = self.source.message_times(chunk, channel)
                 if times is None:
-                    times = [record.log_ns for record in self._source.messages(chunk) if record.channel == channel]
+                    times = [record.log_ns for record in self.source.messages(chunk) if record.channel == channel]
                 found += times
         return sorted(found)
 
@@ -134,61 +98,56 @@ class FileReader:
         however often it is asked for.
         """
         latest = self._latest(stamp_ns, self._channels_of(fields))
-        state = {field: message for field, record in latest.items() if (message := self._restore(record)) is not None}
+        state = {field: self._restore(record) for field, record in latest.items()}
         return max((record.log_ns for record in latest.values()), default=-1), state
-
-    def close(self) -> None:
-        """Close the file; forgotten readers close it when they are collected."""
-        self._source.close()
 
     def _message(self, record: Record) -> Any:
         if isinstance(record.payload, Message):
             return record.payload
         try:
-            message = self.contents.decode(record)
-            fault = shape_error(message)
+            return self.decode(record)
         except SessionError as error:
-            fault = str(error)
-        if not fault:
-            return message
-        fault = f"{self.contents.channels[record.channel].topic} at {record.log_ns} ns: {fault}"
-        if self._skip is None:
-            raise DamageError(self.path, fault)
-        self._skip(fault)
-        return None
+            raise self._damage_error(record, error) from error
+
+    def _damage_error(self, record: Record, error: SessionError) -> DamageError:
+        path = self.channels[record.channel].topic
+        return DamageError(self.source.path, f"{path} at {record.log_ns} ns: {error}")
 
     def _decoded_frame(self, record: Record) -> Record:
         """An image decoded, in a thread; where that fails, the error is raised when its turn comes."""
         if record.channel not in self._frame_channels or isinstance(record.payload, Message) or not self._lossless:
             return record
         try:
-            frame = self.contents.decode(record)
+            frame = self.decode(record)
         except SessionError:
             return record
-        sound = not shape_error(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
-        return record._replace(payload=frame) if sound else record
+        return record._replace(payload=frame) if frame.image.nbytes <= _GROWTH * len(record.payload) else record
+
+    def _records_of(self, channels: set[int], decode: _Decode | None = None) -> Iterator[Record]:
+        """The messages of some channels in order of time."""
+        with _threads() as executor:
+            for record in _merge(self.source, self._chunks_with(channels), executor, decode):
+                if record.channel in channels:
+                    yield record
 
     def _restore(self, record: Record) -> Any:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
-        key = (self.path, record.channel, record.log_ns)
-        message = self._cache.pop(key, None) or self._message(record)
-        if message is None:
-            return None
-        self._cache[key] = message
+        key = (self.source.path, record.channel, record.log_ns)
+        self._cache[key] = message = self._cache.pop(key, None) or self._message(record)
         if len(self._cache) > _CACHED_MESSAGES:
             del self._cache[next(iter(self._cache))]
         return message
 
-    def _records(self, start_ns: int | None, with_frames: bool) -> Iterator[Record]:
+    def _records_from(self, start_ns: int | None, with_frames: bool) -> Iterator[Record]:
         """The messages of known topics from a time on, state and frames merged."""
         start = 0 if start_ns is None else start_ns
         state, frames = self._chunks_from(start)
-        wanted = set(self._fields) if with_frames else set(self._fields) - self._frame_channels
+        wanted = set(self.fields) if with_frames else set(self.fields) - self._frame_channels
         read = dict.fromkeys(wanted, 0)
         with _threads() as executor:
-            streams = [_merge(self._source, state, executor)]
+            streams = [_merge(self.source, state, executor)]
             if with_frames:
-                streams.append(_merge(self._source, frames, executor, self._decoded_frame))
+                streams.append(_merge(self.source, frames, executor, self._decoded_frame))
             for record in heapq.merge(*streams, key=_by_time):
                 if record.log_ns >= start and record.channel in wanted:
                     read[record.channel] += 1
@@ -199,23 +158,21 @@ class FileReader:
     def _check_counts(self, read: Mapping[int, int]) -> None:
         """Raise DamageError for a file with other numbers of messages than its index says."""
         for channel, count in read.items():
-            announced = self.contents.statistics.channel_message_counts.get(channel, 0)
+            announced = self.statistics.channel_message_counts.get(channel, 0)
             if count != announced:
-                path = self.contents.channels[channel].topic
-                raise DamageError(self.path, f"{announced} messages of {path} are announced, {count} were read")
+                path = self.channels[channel].topic
+                raise DamageError(self.source.path, f"{announced} messages of {path} are announced, {count} were read")
 
     def _chunks_from(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
         """Chunks that end at or after a time: those with anything but frames, and those with frames only."""
         state: list[ChunkIndex] = []
         frames: list[ChunkIndex] = []
-        largest_bytes = PIXELS_LIMIT * pixel_type(self.contents.frame_bits).itemsize + _LARGE_CHUNK_BYTES
-        for chunk in self._chunks_with(set(self._fields)):
+        largest_bytes = PIXELS_LIMIT * pixel_type(self.frame_bits).itemsize + _LARGE_CHUNK_BYTES
+        for chunk in self._chunks_with(set(self.fields)):
             if chunk.message_end_time >= start_ns:
                 only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
                 if only_frames and chunk.uncompressed_size > largest_bytes:
-                    raise self._source.damage_error(
-                        chunk.chunk_start_offset, "images of more pixels than flowrec reads"
-                    )
+                    raise self.source.damage_error(chunk.chunk_start_offset, "images of more pixels than flowrec reads")
                 (frames if only_frames else state).append(chunk)
         return state, frames
 
@@ -223,27 +180,27 @@ class FileReader:
         # A chunk without an index may contain anything.
         return [
             chunk
-            for chunk in self.contents.chunks
+            for chunk in self.chunks
             if not chunk.message_index_offsets or not channels.isdisjoint(chunk.message_index_offsets)
         ]
 
     def _channels_of(self, fields: Collection[str]) -> set[int]:
-        return {channel for channel, field in self._fields.items() if field in fields}
+        return {channel for channel, field in self.fields.items() if field in fields}
 
     def _latest(self, stamp_ns: int, channels: set[int]) -> dict[str, Record]:
         latest: dict[str, Record] = {}
-        size = _StateSize(self.path)
+        size = _StateSize(self.source.path)
         chunks = [chunk for chunk in self._chunks_with(channels) if chunk.message_start_time <= stamp_ns]
         chunks.sort(key=lambda chunk: chunk.message_end_time, reverse=True)
-        self._source.prefetch(_likely(chunks, channels, stamp_ns))
+        self.source.prefetch(_likely(chunks, channels, stamp_ns))
         for chunk in chunks:
             end_ns = min(chunk.message_end_time, stamp_ns)
             found = channels & set(chunk.message_index_offsets) if chunk.message_index_offsets else channels
-            fields = {self._fields[channel] for channel in found}
+            fields = {self.fields[channel] for channel in found}
             if all(field in latest and latest[field].log_ns >= end_ns for field in fields):
                 continue
-            for record in self._source.messages(chunk):
-                field_name = self._fields.get(record.channel)
+            for record in self.source.messages(chunk):
+                field_name = self.fields.get(record.channel)
                 if field_name not in fields or field_name is None or record.log_ns > stamp_ns:
                     continue
                 if field_name not in latest or latest[field_name].log_ns <= record.log_ns:

@@ -34,28 +34,20 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER = struct.Struct(">IIBBBBB")  # width, height, bits, colour type, compression, filter, interlace
 _SIZE = struct.Struct(">I")
 _UP = 2  # PNG's filter that stores each row as its difference from the one above
-_JPEG_QUALITY = 90
 # Deflate compresses no more than 1032 pixels into one byte, baseline JPEG fewer.
 _PIXELS_PER_BYTE = 1100
 CAMERA_FRAME = "camera"  # coordinate frame of the images, for viewers; see viewer_scene.py
 PIXELS_LIMIT = 32 << 20  # an image is in memory twice while it is decoded
-# Filter and strategy by which cv2's PNG is three times quicker than by default and smaller, on camera noise.
-_PNG_OPTIONS = (
-    cv2.IMWRITE_PNG_FILTER,
-    cv2.IMWRITE_PNG_FILTER_SUB,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
-)
-
-
-def png(image: Image) -> Payload:
-    """A PNG file, compressed with Huffman codes."""
-    return (_encode_image(".png", image, _PNG_OPTIONS),)
-
-
-def jpeg(image: Image) -> Payload:
-    """A JPEG file of quality 90; its pixels are off by some grey levels."""
-    return (_encode_image(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY)),)
+_OPTIONS = {
+    # Filter and strategy by which cv2's PNG is three times quicker than by default and smaller, on camera noise.
+    "png": (
+        cv2.IMWRITE_PNG_FILTER,
+        cv2.IMWRITE_PNG_FILTER_SUB,
+        cv2.IMWRITE_PNG_STRATEGY,
+        cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+    ),
+    "jpeg": (cv2.IMWRITE_JPEG_QUALITY, 90),  # pixels are off by some grey levels
+}
 
 
 def row_differences(image: Image) -> Payload:
@@ -149,12 +141,13 @@ def _sums(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image
 
 
-def _encode_image(kind: str, image: Image, options: tuple[int, ...]) -> memoryview:
+def _encode_image(file_format: str, image: Image) -> Payload:
+    """A PNG file, compressed with Huffman codes, or a JPEG file."""
     _refuse_empty(image)
     try:
-        return cv2.imencode(kind, image, options)[1].reshape(-1).data
+        return (cv2.imencode(f".{file_format}", image, _OPTIONS[file_format])[1].reshape(-1).data,)
     except cv2.error as error:
-        raise ValueError(f"an image of shape {image.shape} that {kind} can not hold") from error
+        raise ValueError(f"an image of shape {image.shape} that .{file_format} can not hold") from error
 
 
 def _refuse_empty(image: Image) -> None:
@@ -207,17 +200,20 @@ class FrameEncoding:
     Attributes
     ----------
     name : value of `recording.frames`.
-    codec : Frame <-> payload, for images of 8 bit unless the encoding is one of `of`.
     compressed_chunks : whether the chunks are compressed.
     lossless : whether the same pixels are read back.
     bits : depth of the images.
     """
 
     name: str
-    codec: Codec
     compressed_chunks: bool
     lossless: bool = True
     bits: int = 8
+
+    @property
+    def codec(self) -> Codec:
+        """Frame <-> payload."""
+        return _codec(self.name, self.bits)
 
     def of(self, bits: int) -> FrameEncoding:
         """The encoding for images of a depth; raises UsageError if it can not hold them."""
@@ -225,7 +221,7 @@ class FrameEncoding:
             return self
         if not self.lossless:
             raise UsageError(f"recording.frames = {self.name!r} holds 8 bit, the camera has {bits}; set it to 'auto'")
-        return replace(self, codec=_codec(self.name, bits), bits=bits)
+        return replace(self, bits=bits)
 
 
 def encoding_for(width_px: int, height_px: int, rate_hz: float, bits: int = 8) -> str:
@@ -314,18 +310,19 @@ def _sequence(frame: Frame) -> int:
 def _codec(name: str, bits: int) -> Codec:
     if name in ("raw", "zstd"):
         return _raw_image(bits)
-    file_format, file_of = {"delta": ("png", row_differences), "png": ("png", png), "jpeg": ("jpeg", jpeg)}[name]
-    return _compressed_image(file_format, file_of, bits)
+    if name == "delta":
+        return _compressed_image("png", row_differences, bits)
+    return _compressed_image(name, functools.partial(_encode_image, name), bits)
 
 
 ENCODINGS = {
     encoding.name: encoding
     for encoding in (
-        FrameEncoding("raw", _codec("raw", 8), compressed_chunks=False),
-        FrameEncoding("zstd", _codec("zstd", 8), compressed_chunks=True),
-        FrameEncoding("delta", _codec("delta", 8), compressed_chunks=True),
-        FrameEncoding("png", _codec("png", 8), compressed_chunks=False),
-        FrameEncoding("jpeg", _codec("jpeg", 8), compressed_chunks=False, lossless=False),
+        FrameEncoding("raw", compressed_chunks=False),
+        FrameEncoding("zstd", compressed_chunks=True),
+        FrameEncoding("delta", compressed_chunks=True),
+        FrameEncoding("png", compressed_chunks=False),
+        FrameEncoding("jpeg", compressed_chunks=False, lossless=False),
     )
 }
 

@@ -10,11 +10,20 @@ import io
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 
 if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
     from flowrec.core import Message
@@ -37,8 +46,6 @@ CHUNK_LIMIT_BYTES = 72 << 20
 MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
 # Of schemas, channels, metadata and attachments together, each of which takes some 20 us. flowrec writes 60.
 DECLARED_LIMIT = 10_000
-
-_Declared = TypeVar("_Declared", Schema, Channel)
 
 
 class Record(NamedTuple):
@@ -88,6 +95,23 @@ class Summary:
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
+
+    def enter(self, record: Schema | Channel | Metadata | Attachment, offset: int, length: int) -> None:
+        """Enter a record outside the chunks, which stands at a place in the file.
+
+        Raises
+        ------
+        ValueError : another schema or channel has the same number.
+        """
+        if isinstance(record, Metadata):
+            self.metadata.append(MetadataIndex(offset, length, record.name))
+        elif isinstance(record, Attachment):
+            times, size = (record.log_time, record.create_time), len(record.data)
+            self.attachments.append(AttachmentIndex(offset, length, *times, size, record.name, record.media_type))
+        else:
+            known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+            if known.setdefault(record.id, record) != record:
+                raise ValueError(f"{type(record).__name__.lower()} {record.id} is declared twice, differently")
 
     def count(self, counts: Mapping[int, int], chunks: int, first_ns: int, last_ns: int) -> None:
         """Set the statistics: messages by channel, number of chunks and their times."""
@@ -145,10 +169,8 @@ def parse_summary(data: bytes, data_start: int, data_end: int) -> Summary:
         if declared > DECLARED_LIMIT:
             raise ValueError(f"more than {DECLARED_LIMIT} records besides chunks")
         stream = stream_of(data[at : at + length])
-        if opcode == Opcode.SCHEMA:
-            declare(summary.schemas, Schema.read(stream))
-        elif opcode == Opcode.CHANNEL:
-            declare(summary.channels, Channel.read(stream))
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            summary.enter((Schema if opcode == Opcode.SCHEMA else Channel).read(stream), at, length)
         elif opcode == Opcode.ATTACHMENT_INDEX:
             summary.attachments.append(AttachmentIndex.read(stream))
         elif opcode == Opcode.METADATA_INDEX:
@@ -180,17 +202,6 @@ def records_in(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
 def stream_of(data: bytes | memoryview) -> ReadDataStream:
     """Stream from which mcap's records parse themselves."""
     return ReadDataStream(io.BytesIO(data))
-
-
-def declare(known: dict[int, _Declared], record: _Declared) -> None:
-    """Enter a schema or channel.
-
-    Raises
-    ------
-    ValueError : another one has the same number.
-    """
-    if known.setdefault(record.id, record) != record:
-        raise ValueError(f"{type(record).__name__.lower()} {record.id} is declared twice, differently")
 
 
 def _chunk_index(data: bytes, at: int, end: int, interned: dict[tuple[bytes, bytes], dict[int, int]]) -> ChunkIndex:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -17,7 +17,18 @@ import zstandard
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, ChunkIndex, Footer, Header, MessageIndex, Metadata, MetadataIndex
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Footer,
+    Header,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+)
 
 from flowrec.core import SessionError
 from flowrec.store.byte_source import open_bytes
@@ -46,6 +57,7 @@ _AT_ONCE_BYTES, _WINDOW_LIMIT_BYTES = 8 << 20, 8 << 20
 _HEADER_LIMIT_BYTES = 1 << 16
 _SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
 _SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
+_PARSED: dict[Opcode, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 _LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: 256 << 20}
 
 # What the libraries raise on damaged bytes, as found by reading thousands of mutated files.
@@ -165,20 +177,24 @@ class McapReader:
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""
-        record: Metadata = self.record(index.offset, index.length, Opcode.METADATA, Metadata.read)
-        return dict(record.metadata)
+        return dict(self.record(index.offset, index.length, Opcode.METADATA).metadata)
 
     def attachment(self, index: AttachmentIndex) -> bytes:
         """The content of one attachment, checksum verified."""
-        found = self.attachment_at(index.offset, index.length)
+        found = self.record(index.offset, index.length, Opcode.ATTACHMENT)
         if len(found.data) != index.data_size or found.name != index.name:
             raise self.damage_error(index.offset, f"{found.name!r} is not what the index describes")
         return bytes(found.data)
 
-    def attachment_at(self, offset: int, length: int) -> Attachment:
-        """One attachment, checksum verified."""
-        body = self.body(offset, length, Opcode.ATTACHMENT)
+    def record(self, offset: int, length: int, opcode: Opcode) -> Any:
+        """One record outside the chunks, parsed; `length` includes its head. The checksum of an attachment is verified.
+
+        The data of an attachment is a view, because a copy may be large.
+        """
+        body = self.body(offset, length, opcode)
         with self.parsing(offset):
+            if opcode != Opcode.ATTACHMENT:
+                return _PARSED[opcode].read(stream_of(body))
             log_ns, create_ns, name_bytes = ATTACHMENT_HEAD.unpack_from(body)
             name, at = _text(body, ATTACHMENT_HEAD.size, name_bytes)
             media_type, at = _text(body, at + 4, *CRC.unpack_from(body, at))
@@ -189,7 +205,7 @@ class McapReader:
             (crc,) = CRC.unpack_from(body, at)
             if crc and zlib.crc32(body[:at]) != crc:
                 raise ValueError(f"the checksum of {name!r} is wrong")
-        return Attachment(create_ns, log_ns, name, media_type, data)  # type: ignore[arg-type]  # a view is not copied
+            return Attachment(create_ns, log_ns, name, media_type, data)  # type: ignore[arg-type]
 
     def content(self, offset: int, length: int) -> bytes | memoryview:
         """The content of a chunk, decompressed within the limits, checksum verified."""
@@ -199,24 +215,24 @@ class McapReader:
         with self.parsing(offset):
             _, _, size, crc, name_bytes = CHUNK_HEAD.unpack_from(body)
             compression, at = _text(body, CHUNK_HEAD.size, name_bytes)
-            begin = at + LONG.size
-            if LONG.unpack_from(body, at)[0] != length - RECORD_HEAD.size - begin:
+            data = body[at + LONG.size :]
+            (nbytes,) = LONG.unpack_from(body, at)
+            if nbytes != length - RECORD_HEAD.size - at - LONG.size:
                 raise ValueError("the chunk is not as long as announced")
-            if not whole and _can_be_streamed(body[begin:], compression):
-                content: bytes | memoryview = self._decompress_stream(
-                    offset + RECORD_HEAD.size + begin, offset + length, body[begin:], size
-                )
+            _refuse_bomb(size, nbytes)
+            if compression == "zstd":
+                _refuse_other_size(data, size)
+            if not whole and _can_be_streamed(data, compression):
+                content: bytes | memoryview = self._decompress_stream(offset + length - nbytes, offset + length, size)
             else:
-                body = body if whole else self.body(offset, length, Opcode.CHUNK)
-                content = _decompress(body[begin:], compression, size)
+                data = data if whole else self.body(offset, length, Opcode.CHUNK)[at + LONG.size :]
+                content = _decompress(data, compression, size)
             if crc and zlib.crc32(content) != crc:
                 raise ValueError("the checksum of the chunk is wrong")
         return content
 
-    def _decompress_stream(self, start: int, end: int, begin: memoryview, size: int) -> memoryview:
-        """The zstd frame from byte `start` to `end`, which starts with `begin`, decompressed in small steps."""
-        _refuse_bomb(size, end - start)
-        _refuse_other_size(begin, size)
+    def _decompress_stream(self, start: int, end: int, size: int) -> memoryview:
+        """The zstd frame from byte `start` to `end`, decompressed in small steps."""
         content = memoryview(bytearray(size))
         unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_LIMIT_BYTES)
         at = 0
@@ -297,12 +313,6 @@ class McapReader:
         if length > limit:
             raise self.damage_error(offset, f"a {opcode.name.lower()} of {length} bytes, more than {limit}")
 
-    def record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> Any:
-        """One small record with that opcode, parsed; `length` includes the head of the record."""
-        body = self.body(offset, length, opcode)
-        with self.parsing(offset):
-            return parse(stream_of(body))
-
 
 class _Range:
     """A range of a file as a stream."""
@@ -343,11 +353,9 @@ def _can_be_streamed(begin: memoryview, compression: str) -> bool:
 
 
 def _decompress(data: memoryview, compression: str, size: int) -> bytes | memoryview:
-    _refuse_bomb(size, len(data))
     if compression == "":
         content: bytes | memoryview = data
     elif compression == "zstd":
-        _refuse_other_size(data, size)
         # A new one each time: they are cheap, and may not be shared between threads.
         content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size) if size else b""
     else:

@@ -9,19 +9,19 @@ few it would be sufficient. Layout: https://mcap.dev/spec.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sys
 import zlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     ChunkIndex,
     DataEnd,
@@ -29,12 +29,11 @@ from mcap.records import (
     Header,
     McapRecord,
     Metadata,
-    MetadataIndex,
     Schema,
     SummaryOffset,
 )
 
-from flowrec.core import open_new
+from flowrec.core import SessionError, open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary
 
@@ -79,17 +78,8 @@ class McapWriter:
     def add(self, record: Metadata | Attachment | Schema | Channel) -> None:
         """Write a record outside the chunks."""
         data = _bytes_of(record)
-        if isinstance(record, Schema):
-            self._summary.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self._summary.channels[record.id] = record
-        else:
-            if isinstance(record, Metadata):
-                self._summary.metadata.append(MetadataIndex(self.size, len(data), record.name))
-            else:
-                times, size = (record.log_time, record.create_time), len(record.data)
-                place = AttachmentIndex(self.size, len(data), *times, size, record.name, record.media_type)
-                self._summary.attachments.append(place)
+        self._summary.enter(record, self.size, len(data))
+        if isinstance(record, Metadata | Attachment):
             self._head_digest += head_digest(record)
         self._append(data)
 
@@ -214,3 +204,42 @@ def _chunk_head(chunk: SealedChunk) -> bytes:
     )
     head += name + LONG.pack(len(chunk.data))
     return RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(chunk.data)) + head
+
+
+class FileError(SessionError):
+    """A file that can not be written; the text names it and says what to do."""
+
+
+def new_mcap(path: Path, *, overwrite: bool) -> McapWriter:
+    """Begin a file; raises FileError where it can not be made."""
+    try:
+        return McapWriter(path, overwrite=overwrite)
+    except OSError as error:
+        raise not_writable(path, error) from error
+
+
+@contextlib.contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turns an OSError of writing the file into a FileError that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise _disk_failed(path, error) from error
+
+
+def not_writable(path: Path, error: OSError) -> FileError:
+    """The error for a file that can not be made."""
+    if isinstance(error, FileNotFoundError):
+        return FileError(f"{path.parent}: no such directory; make it, or choose another place with --out")
+    if isinstance(error, BlockingIOError):
+        return FileError(f"{path}: is being written by another process just now; choose another name with --out")
+    return FileError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
+
+
+def _disk_failed(path: Path, error: OSError) -> FileError:
+    if error.errno == errno.ENOENT:
+        return FileError(
+            f"{path}: no longer exists: the file or its directory was removed or renamed during the recording"
+        )
+    what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
+    return FileError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")

@@ -10,15 +10,16 @@ import os
 import re
 import socket
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urljoin, urlsplit
 
 from flowrec.core import SessionError, UsageError
-from flowrec.store.traffic import AbsentError, ForbiddenError, RefusedError, TransientError
+from flowrec.store.traffic import HiddenError, MissingError, RefusedError, TransientError
 
 CONNECTIONS = 32  # requests at a time
 _REDIRECTS = 3
@@ -27,9 +28,7 @@ _ENDPOINTS = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AZURE_
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
 _OK, _PARTIAL, _NO_RANGE, NOT_OFFERED = 200, 206, 416, 501
 _LATER = (408, 425, 429)  # a time limit, too early, too many requests
-_REFUSED = "refuses access ({}); check the credentials in the environment"
 _NOT_INSTALLED = "{}: reading from a URL needs a package; pip install 'flowrec[remote]'"
-_MISSING = "is not there (404); check the name"
 _WHOLE_ONLY = "can not be read in ranges, the server sends whole files only; copy it to this machine"
 _NO_RANGE_TOLD = "can not be read: the server answers 206 without a range"
 
@@ -50,6 +49,11 @@ class Answer:
     size: int
     version: str
 
+    @property
+    def end(self) -> int:
+        """Offset after the last byte."""
+        return self.first + len(self.data)
+
 
 class OtherRangeError(TransientError):
     """The server has sent another range than was asked for; `size` of the object is 0 where it is not known."""
@@ -59,7 +63,7 @@ class OtherRangeError(TransientError):
         self.size = size
 
 
-class ObjectRequests(Protocol):
+class ObjectRequests(ABC):
     """Requests for one object, from several threads at a time."""
 
     def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
@@ -69,6 +73,17 @@ class ObjectRequests(Protocol):
         ------
         TransientError, RefusedError : it failed, in a few words.
         """
+        end_s = time.monotonic() + timeout_s
+        try:
+            return self._get(first, length, end_s)
+        except OtherRangeError as error:  # a server that takes "the last bytes" for something else
+            if first is not None:
+                raise
+            return self._get(max(0, error.size - length), length, end_s)
+
+    @abstractmethod
+    def _get(self, first: int | None, length: int, end_s: float) -> Answer:
+        """Bytes as of `get`; OtherRangeError, with the size of the object, where the last ones are not to be had so."""
 
 
 def requests_for(url: str, timeout_s: float) -> ObjectRequests:
@@ -121,7 +136,7 @@ def listing(url: str, begin: str, timeout_s: float) -> list[ListedObject]:
     return sorted(bucket.objects(begin), key=lambda each: each.name)
 
 
-class _Bucket:
+class _Bucket(ObjectRequests):
     """An object or folder of s3, gs or az; credentials and endpoint come from the environment."""
 
     def __init__(self, url: str, timeout_s: float) -> None:
@@ -131,7 +146,7 @@ class _Bucket:
         scheme, _, rest = url.partition("://")
         bucket, _, self._key = rest.partition("/")
         limit = timedelta(seconds=timeout_s)
-        self._without_suffix = scheme == "az"
+        self._takes_suffix = scheme != "az"
         try:
             self._store = from_url(
                 f"{scheme}://{bucket}",
@@ -150,35 +165,34 @@ class _Bucket:
                 ) from error
             raise SessionError(f"{url}: is no URL of a bucket ({in_a_line(error)})") from error
 
-    def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
-        if first is None and not self._without_suffix:
-            try:
-                return self._get(None, length)
-            except OtherRangeError:  # a store that takes "the last bytes" for something else
-                self._without_suffix = True
-        return self._get(first, length)
-
-    def _get(self, first: int | None, length: int) -> Answer:
+    def _get(self, first: int | None, length: int, end_s: float) -> Answer:
         import obstore
 
-        with _bucket_faults() as faults:
-            if first is None and self._without_suffix:
-                first = max(0, obstore.head(self._store, self._key)["size"] - length)
-            wanted: Any = {"suffix": length} if first is None else (first, first + length)
-            found = obstore.get(self._store, self._key, options={"range": wanted})
-            meta, (begin, end) = found.meta, found.range
-            data = bytes(found.bytes())
-        if faults.empty:
+        wanted: Any = {"suffix": length} if first is None else (first, first + length)
+        try:
+            with _bucket_errors():
+                if first is None and not self._takes_suffix:
+                    raise OtherRangeError("", obstore.head(self._store, self._key)["size"])
+                found = obstore.get(self._store, self._key, options={"range": wanted})
+                meta, (begin, end) = found.meta, found.range
+                data = bytes(found.bytes())
+        except _NoRangeError:
             return Answer(b"", 0, 0, "")
+        except OtherRangeError:
+            if first is None and self._takes_suffix:
+                self._takes_suffix = False
+                return self._get(None, length, end_s)
+            raise
         if len(data) != end - begin:
             raise TransientError(f"the server sent {len(data)} of {end - begin} bytes")
         return Answer(data, begin, meta["size"], _version(meta))
 
     def objects(self, begin: str) -> Iterator[ListedObject]:
+        """As of `listing`, in any order."""
         import obstore
 
         folder = f"{self._key}/" if self._key else ""
-        with _bucket_faults():
+        with _bucket_errors():
             if not begin:
                 for meta in obstore.list_with_delimiter(self._store, self._key or None)["objects"]:
                     yield ListedObject(meta["path"].removeprefix(folder), meta["size"], _version(meta))
@@ -193,30 +207,25 @@ class _Bucket:
                         yield ListedObject(name, meta["size"], _version(meta))
 
 
-@dataclass(slots=True)
-class _Faults:
-    """State of a request to a bucket: `empty` if the object has no bytes, of which no range can be had."""
-
-    empty: bool = False
+class _NoRangeError(RefusedError):
+    """The object has no bytes, of which no range can be had."""
 
 
 @contextmanager
-def _bucket_faults() -> Iterator[_Faults]:
+def _bucket_errors() -> Iterator[None]:
     """Turn the errors of obstore into ours."""
     from obstore import exceptions
 
-    faults = _Faults()
     try:
-        yield faults
+        yield
     except (exceptions.NotFoundError, FileNotFoundError) as error:
-        raise AbsentError(_MISSING) from error
+        raise of_status(404) from error
     except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError) as error:
-        raise ForbiddenError(_REFUSED.format("403")) from error
+        raise of_status(403) from error
     except (exceptions.BaseError, OSError, ValueError) as error:
         text = in_a_line(error)
         if "416" in text and "ange" in text:
-            faults.empty = True
-            return
+            raise _NoRangeError("has no bytes (416)") from error
         if "UnexpectedRange" in text:
             raise OtherRangeError("the server sends other bytes than those that are asked for") from error
         if "NotPartial" in text or "NoContentRange" in text:
@@ -230,9 +239,9 @@ def _bucket_faults() -> Iterator[_Faults]:
 def of_status(status: int) -> Exception:
     """The error of an answer that is none."""
     if status in (401, 403):
-        return ForbiddenError(_REFUSED.format(status))
+        return RefusedError(f"refuses access ({status}); check the credentials in the environment", HiddenError)
     if status in (404, 410):
-        return AbsentError(_MISSING)
+        return RefusedError("is not there (404); check the name", MissingError)
     if status == NOT_OFFERED:
         return RefusedError(f"the server does not offer what is asked of it ({status})")
     if status >= 500 or status in _LATER:
@@ -244,7 +253,7 @@ def _version(meta: Mapping[str, Any]) -> str:
     return meta.get("e_tag") or str(meta.get("last_modified") or "")
 
 
-class _Http:
+class _Http(ObjectRequests):
     """An object of an http server. Redirects are followed, but never from a public host to a private one."""
 
     def __init__(self, url: str) -> None:
@@ -252,15 +261,6 @@ class _Http:
 
         self._url = url
         self._pool = urllib3.PoolManager(maxsize=CONNECTIONS, retries=False)
-
-    def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
-        end_s = time.monotonic() + timeout_s
-        if first is None:
-            try:
-                return self._get(None, length, end_s)
-            except OtherRangeError as error:  # a server that takes "the last bytes" for something else
-                first = max(0, error.size - length)
-        return self._get(first, length, end_s)
 
     def _get(self, first: int | None, length: int, end_s: float) -> Answer:
         import urllib3

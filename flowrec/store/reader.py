@@ -1,20 +1,23 @@
-"""Session -> ticks, whether it is one file or a run in parts."""
+"""Session -> ticks and images, whether it is one file or a run in parts."""
 
 from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Collection, Iterable, Iterator
+import operator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, overload
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.core import COILS, Frame, SessionError, Tick, TopicTable, array_shapes, seconds
 from flowrec.store.byte_source import is_there
-from flowrec.store.channels import SessionContents
+from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.roi import Region
-from flowrec.store.rows import Row
 from flowrec.store.run_files import Run, RunFile
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.session_path import session_path
@@ -31,7 +34,7 @@ class SessionReader:
     Parameters
     ----------
     path : the session.
-    contents, skip : of a single file, as in file_reader.py.
+    file : the same, where it is a single file that is open already.
 
     Attributes
     ----------
@@ -42,7 +45,6 @@ class SessionReader:
         replay starts. None where the session begins with the run.
     outcome : how the run ended: `outcome`, `reason`, `ticks`, `dropped_frames`, ...; all text, may be empty.
     first_ns, last_ns : stamps of the first and the last tick; both 0 in an empty session.
-    flowrec_version : of the program that wrote it.
 
     Raises
     ------
@@ -50,16 +52,14 @@ class SessionReader:
         whole run; on reading, damage.
     """
 
-    def __init__(
-        self, path: Path | str, contents: SessionContents | None = None, skip: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, path: Path | str, file: FileReader | None = None) -> None:
         self.path = session_path(path)
         self._cache: Cache = {}
         self._closed = False
         self._open: dict[int, FileReader] = {}  # the one that was used longest ago first
-        if contents is not None or is_there(self.path):
-            self._open[0] = first = FileReader(self.path, contents, skip, self._cache)
-            self._run = Run(self.path, [RunFile.of(first.contents)])
+        if file is not None or is_there(self.path):
+            self._open[0] = first = file or FileReader(self.path, self._cache)
+            self._run = Run(self.path, [RunFile.of(first)])
         else:
             self._run = Run.at(self.path)
         self.files = [file.path for file in self._run.files]
@@ -67,12 +67,11 @@ class SessionReader:
         self.keyframe_ns = self.part.keyframe_ns if self.part is not None else None
         self.first_ns, self.last_ns = self._run.first_ns, self._run.last_ns
         self.outcome = self._run.outcome
-        self.flowrec_version = self._run.files[0].flowrec_version
 
     @functools.cached_property
     def topics(self) -> TopicTable:
         """The topics that this flowrec knows, and those that the session declares."""
-        return self._file(0).contents.topics
+        return self._file(0).topics
 
     @functools.cached_property
     def _fields(self) -> list[set[str]]:
@@ -82,17 +81,17 @@ class SessionReader:
     @functools.cached_property
     def header(self) -> SessionHeader:
         """Configuration, chip, provenance and weights."""
-        return self._file(0).contents.header
+        return self._file(0).header
 
     @functools.cached_property
     def region(self) -> Region | None:
         """Window of most images that was recorded, the rest being black (roi.py); None: the images are not cut."""
-        return self._file(0).contents.region
+        return self._file(0).region
 
     @functools.cached_property
     def frame_bits(self) -> int:
         """Depth of the images."""
-        return self._file(0).contents.frame_bits
+        return self._file(0).frame_bits
 
     @functools.cached_property
     def counts(self) -> dict[str, int]:
@@ -113,7 +112,7 @@ class SessionReader:
     @property
     def recorded_fields(self) -> dict[str, frozenset[str]]:
         """Names of the message fields that the file has, by field of Tick, for the topics that it declares."""
-        return self._file(0).contents.recorded_fields
+        return self._file(0).recorded_fields
 
     @property
     def duration_s(self) -> float:
@@ -169,11 +168,10 @@ class SessionReader:
         SessionError : no such field, or damage in the file.
         """
         field = self.field_of(field)
-        for number, file in enumerate(self._run.files):
-            if field in self._fields[number]:
-                for stamp_ns, message in self._file(number).messages(field):
-                    if not number or stamp_ns > file.first_ns:
-                        yield message
+        for file, keyframe_ns in self._files_with({field}):
+            for stamp_ns, message in file.messages(field):
+                if stamp_ns > keyframe_ns:
+                    yield message
 
     def field_of(self, name: str) -> str:
         """The field of Tick of a topic, named by its field or by its path; SessionError if there is none."""
@@ -184,16 +182,15 @@ class SessionReader:
         return topic.field
 
     def rows(self, fields: Collection[str]) -> Iterator[tuple[str, Row]]:
-        """Field of Tick and row of plain values (see rows.py) of each message of some topics, in order of time.
+        """Field of Tick and row of plain values (channels.py) of each message of some topics, in order of time.
 
         The rows of "frame" come last. They are made from the file's index, without numbers and images, which are None.
         """
         small = set(fields) - {"frame"}
-        for number, file in enumerate(self._run.files):
-            if self._fields[number] & small:
-                for stamp_ns, field, row in self._file(number).rows(small):
-                    if not number or stamp_ns > file.first_ns:
-                        yield field, row
+        for file, keyframe_ns in self._files_with(small):
+            for stamp_ns, field, row in file.rows(small):
+                if stamp_ns > keyframe_ns:
+                    yield field, row
         if "frame" in fields:
             for stamp_ns in self.frame_stamps:
                 yield "frame", (stamp_ns, None, None, self.frame_bits)
@@ -205,12 +202,12 @@ class SessionReader:
 
     def stamps(self, field: str) -> list[int]:
         """The stamps of the ticks with a new message of a topic, in order; from the index, no message is read."""
-        found: list[int] = []
-        for number, file in enumerate(self._run.files):
-            if field in self._fields[number]:
-                stamps = self._file(number).stamps(field)
-                found += [stamp_ns for stamp_ns in stamps if not number or stamp_ns > file.first_ns]
-        return found
+        return [
+            stamp_ns
+            for file, keyframe_ns in self._files_with({field})
+            for stamp_ns in file.stamps(field)
+            if stamp_ns > keyframe_ns
+        ]
 
     def frame_at(self, stamp_ns: int) -> Frame:
         """The image of the tick with this stamp, one of `frame_stamps`; SessionError if it is damaged."""
@@ -237,15 +234,21 @@ class SessionReader:
     ) -> None:
         self.close()
 
+    def _files_with(self, fields: set[str]) -> Iterator[tuple[FileReader, int]]:
+        """The files with messages of some topics, each with the stamp of its keyframe, which is skipped; else -1."""
+        for number, file in enumerate(self._run.files):
+            if self._fields[number] & fields:
+                yield self._file(number), file.first_ns if number else -1
+
     def _file(self, number: int) -> FileReader:
         file = self._open.pop(number, None)
         if file is None:
             if self._closed:
                 raise SessionError(f"{self.path}: has been closed; open the session again")
-            file = FileReader(self.files[number], cache=self._cache)
-            if number and not file.contents.header.is_same_run(self.header):
+            file = FileReader(self.files[number], self._cache)
+            if number and not file.header.is_same_run(self.header):
                 raise SessionError(
-                    f"{file.path}: has another head than {self.files[0].name}, so it is not of the same run;"
+                    f"{file.source.path}: has another head than {self.files[0].name}, so it is not of the same run;"
                     " move it away, or name it alone"
                 )
         self._open[number] = file
@@ -253,3 +256,53 @@ class SessionReader:
             # Not closed here, because an iteration may still read it; it is closed when it is collected.
             del self._open[next(iter(self._open))]
         return file
+
+
+class Frames(Sequence[Frame]):
+    """The images in order. `frames[-1]` reads one image, a loop reads each chunk once; a slice is a sequence again.
+
+    Attributes
+    ----------
+    stamps_ns : (n,) stamps on the session clock; no image is read for them.
+    wall_times : (n,) the same as time of day, UTC; NaT where the file does not state when its clock was 0.
+    """
+
+    def __init__(self, reader: SessionReader, which: range | None = None) -> None:
+        self._reader = reader
+        self._which = which if which is not None else range(len(reader.frame_stamps))
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        return np.array(self._reader.frame_stamps, np.int64)[list(self._which)]
+
+    @property
+    def wall_times(self) -> NDArray[np.datetime64]:
+        start_unix_ns = self._reader.header.start_unix_ns
+        times = (self.stamps_ns + start_unix_ns).view("datetime64[ns]")
+        return times if start_unix_ns else np.full(len(times), np.datetime64("NaT", "ns"))
+
+    def __len__(self) -> int:
+        return len(self._which)
+
+    @overload
+    def __getitem__(self, place: int) -> Frame: ...
+    @overload
+    def __getitem__(self, place: slice) -> Frames: ...
+    def __getitem__(self, place: int | slice) -> Frame | Frames:
+        if isinstance(place, slice):
+            return Frames(self._reader, self._which[place])
+        try:
+            number = self._which[operator.index(place)]
+        except IndexError:
+            raise IndexError(f"frame {place} of {len(self)} in {self._reader.path}") from None
+        return self._reader.frame_at(self._reader.frame_stamps[number])
+
+    def __iter__(self) -> Iterator[Frame]:
+        if len(self._which) == len(self._reader.frame_stamps) and self._which.step == 1:
+            yield from self._reader.messages("frame")
+        else:
+            for number in self._which:
+                yield self._reader.frame_at(self._reader.frame_stamps[number])
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} images of {self._reader.path}>"

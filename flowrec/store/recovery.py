@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flowrec.core import MCAP, Outcome, Output, OutputError, SessionError, hold_file, put_in_place, refuse_irregular
-from flowrec.store.audit import disagreements
+from flowrec.store.audit import disagreements, edits_of
 from flowrec.store.channels import SessionContents
-from flowrec.store.chunk_copies import ChunkCopier
-from flowrec.store.digest import FileDigest
-from flowrec.store.losses import Losses, RecoveryTally, losses
+from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
+from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_reader import DamageError, McapReader
+from flowrec.store.mcap_writer import disk_errors, new_mcap
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import (
     PARTIAL_SUFFIX,
@@ -26,7 +25,7 @@ from flowrec.store.run_files import (
     unfinished_of,
 )
 from flowrec.store.scan import Scan, scan
-from flowrec.store.session_file import WriterOptions, disk_errors, new_mcap
+from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import (
     CHIP_FILE,
     CHIP_IMAGE_FILE,
@@ -98,6 +97,8 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
         raise SessionError(
             f"{path}: is being recorded just now, or recovered; stop that process with Ctrl-C, which completes the file"
         ) from error
+    except DamageError as error:  # its advice is to recover the file
+        raise SessionError(f"{path}: nothing can be saved: {error.what}; remove the file") from error
 
 
 def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
@@ -145,25 +146,24 @@ def _recover(path: Path, out: Path | None) -> Recovered:
         _refuse_if_taken(target)
     if partial and path.is_file() and not path.stat().st_size:
         raise NothingSavedError(f"{path}: is empty; nothing was recorded into it; remove the file")
-    with _without_circular_advice(path):
-        intact = _check_intact(path)
-        if intact is not None:
-            if not partial:
-                return intact
-            _refuse_if_taken(target)
-            _rename(path, target)
-            return Recovered(target, intact.ticks, intact.duration_s)
-        with contextlib.closing(McapReader(path)) as source:
-            declared = scan(source, heads_only=True)
-        if partial and not declared.chunks_passed:
-            raise _nothing_on_disk(path)
-        _require_head(path, declared)
-        contents = SessionContents(path, declared.summary)
+    intact = _check_intact(path)
+    if intact is not None:
+        if not partial:
+            return intact
+        _refuse_if_taken(target)
+        _rename(path, target)
+        return Recovered(target, intact.ticks, intact.duration_s)
+    with contextlib.closing(McapReader(path)) as source:
+        declared = scan(source, heads_only=True)
+    if partial and not declared.chunks_passed:
+        raise _nothing_on_disk(path)
+    _require_head(path, declared)
+    contents = SessionContents(path, declared.summary)
     _refuse_if_taken(target)
     draft = partial_path(target.with_name(f"{target.stem}.recovering{target.suffix}"))
     try:
         with contents:
-            found, kept = _copy_intact(contents, draft)
+            kept = _copy_intact(contents, draft)
         done = _verify(draft)
         if done is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
@@ -179,26 +179,26 @@ def _recover(path: Path, out: Path | None) -> Recovered:
             draft.unlink(missing_ok=True)
     if partial and target == final:
         path.unlink()
-    return Recovered(target, kept.ticks, done.duration_s, found.lost_bytes, kept.lost)
+    return Recovered(target, kept.ticks, done.duration_s, kept.lost_bytes, kept.lost)
 
 
-def _copy_intact(contents: SessionContents, draft: Path) -> tuple[Scan, Losses]:
+def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
     """Copy everything intact of a file into a new one, and complete that."""
     path = contents.source.path
-    tally = RecoveryTally(contents.part.keyframe_ns if contents.part is not None else None)
+    tally = RecoveryTally(contents)
     with contextlib.closing(new_mcap(draft, overwrite=True)) as out, disk_errors(draft):
-        copier = ChunkCopier(contents, found := Scan(), out, tally)
-        scan(contents.source, copier.visit, found=found)
+        copier = ChunkCopier(contents, out, tally)
+        found = scan(contents.source, copier.visit)
         if not found.summary.chunks and path.name.endswith(PARTIAL_SUFFIX):
             raise _nothing_on_disk(path)
-        if tally.end_ns is None:
+        kept = tally.losses(found)
+        if kept is None:
             raise NothingSavedError(
                 f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; "
                 "remove the file"
             )
-        kept = losses(contents, found, tally, tally.end_ns)
         copier.finish(kept.outcome)
-    return found, kept
+    return kept
 
 
 def _nothing_on_disk(path: Path) -> NothingSavedError:
@@ -208,13 +208,13 @@ def _nothing_on_disk(path: Path) -> NothingSavedError:
 def _check_intact(path: Path) -> Recovered | None:
     """A file of which every chunk is intact; None for any other."""
     try:
-        with SessionReader(path, contents := SessionContents(path)) as reader:
-            _ = reader.header
+        with SessionReader(path, file := FileReader(path)) as reader:
+            _ = file.header
             for _tick in reader.ticks():
                 pass
-            for chunk in contents.chunks:  # the rest: viewer topics
-                if contents.fields.keys().isdisjoint(chunk.message_index_offsets):
-                    contents.source.messages(chunk)
+            for chunk in file.chunks:  # the rest: viewer topics
+                if file.fields.keys().isdisjoint(chunk.message_index_offsets):
+                    file.source.messages(chunk)
             repeated = reader.keyframe_ns is not None
             return Recovered(path, reader.counts.get("track", 0) - repeated, reader.duration_s, changed=False)
     except SessionError:
@@ -224,11 +224,10 @@ def _check_intact(path: Path) -> Recovered | None:
 def _verify(draft: Path) -> Recovered | None:
     """A file that was just written; None unless every message is as it was meant, and the index agrees with them."""
     try:
-        with SessionReader(draft, contents := SessionContents(draft)) as reader:
-            _ = reader.header
-            digest = FileDigest(contents.source.start_unix_ns)
-            scanned = scan(contents.source, digest.add)
-            if scanned.lost_bytes or digest.faults(contents) != [] or any(disagreements(contents, scanned)):
+        with SessionReader(draft, file := FileReader(draft)) as reader:
+            _ = file.header
+            scanned = scan(file.source, digests=True)
+            if scanned.lost_bytes or edits_of(file, scanned) != [] or any(disagreements(file, scanned)):
                 return None
             return Recovered(draft, reader.counts.get("track", 0), reader.duration_s)
     except SessionError:
@@ -256,15 +255,6 @@ def _rename(source: Path, target: Path) -> None:
         put_in_place(source, target, overwrite=False)
     except OSError as error:
         raise SessionError(f"{target}: can not be made ({error.strerror}); choose another --out") from error
-
-
-@contextlib.contextmanager
-def _without_circular_advice(path: Path) -> Iterator[None]:
-    """Replaces the advice of a DamageError, which is to recover the file."""
-    try:
-        yield
-    except DamageError as error:
-        raise SessionError(f"{path}: nothing can be saved: {error.what}; remove the file") from error
 
 
 def _end_of_run(path: Path, last: SessionReader, part: Part) -> Recovered:

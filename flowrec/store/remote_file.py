@@ -1,13 +1,15 @@
-"""A session at a URL as a source of bytes: few requests, many at a time, and one version of the object.
+"""Sessions at URLs as sources of bytes, with few requests, many at a time; and the objects of folders in buckets.
 
 Opening asks for the first and the last 256 KiB together: they hold head, index and outcome of most sessions. Both, and
 the rest of a longer index, are remembered for a while, because a session is opened several times in a row. What
 `prefetch` announces is fetched at once, a bounded number of bytes ahead. Each answer must be of the object that was
-opened.
+opened. Nothing lists the files of an http server.
 """
 
 from __future__ import annotations
 
+import fnmatch
+import glob
 import threading
 import time
 import weakref
@@ -18,7 +20,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flowrec.core import SessionError
-from flowrec.store.object_requests import CONNECTIONS, Answer, ObjectRequests, requests_for
+from flowrec.store.object_requests import CONNECTIONS, Answer, ListedObject, ObjectRequests, listing, requests_for
+from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout_s
 
 _END_BYTES = 256 << 10
@@ -34,9 +37,8 @@ class _Opened:
     """An object as it was when it was opened."""
 
     requests: ObjectRequests
-    size: int
-    version: str
-    ends: tuple[Answer, ...]
+    head: Answer
+    tail: Answer
     until_s: float
 
 
@@ -81,8 +83,7 @@ class RemoteFile:
         except BaseException:
             self.close()
             raise
-        self.size = self._object.size
-        self.version = self._object.version
+        self.size, self.version = self._object.tail.size, self._object.tail.version
 
     def read(self, offset: int, length: int) -> bytes:
         if not self._closer.alive:
@@ -91,13 +92,12 @@ class RemoteFile:
         if end <= offset:
             return b""
         opened = self._object
-        for known in opened.ends:
-            if known.first <= offset and end <= known.first + len(known.data):
-                return known.data[offset - known.first : end - known.first]
-        ahead = self._take_ahead(offset, end)
-        if ahead is not None:
+        answer = next((each for each in (opened.head, opened.tail) if _holds(each, offset, end)), None)
+        if answer is not None:
+            pass
+        elif (ahead := self._take_ahead(offset, end)) is not None:
             answer = ahead.result()
-        elif end > opened.ends[1].first - _NEAR_BYTES and opened.ends[1].first - offset <= _JOINED_BYTES:
+        elif end > opened.tail.first - _NEAR_BYTES and opened.tail.first - offset <= _JOINED_BYTES:
             answer = self._longer_tail(opened, offset)
         else:
             answer = self._fetch_unannounced(offset, end)
@@ -105,14 +105,13 @@ class RemoteFile:
 
     def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Ask for ranges (offset, length) that will be read soon; those near each other are one request."""
-        known = [(each.first, each.first + len(each.data)) for each in self._object.ends]
         with self._lock:
-            known += [(each.first, each.end) for each in self._ahead]
+            known: list[Answer | _Ahead] = [self._object.head, self._object.tail, *self._ahead]
             room = _AHEAD_BYTES - sum(each.end - each.first for each in self._ahead)
             joined: list[list[int]] = []
             for offset, length in sorted(ranges):
                 end = min(offset + length, self.size)
-                if length > _JOINED_BYTES or any(first <= offset and end <= last for first, last in known):
+                if length > _JOINED_BYTES or any(_holds(each, offset, end) for each in known):
                     continue
                 last_one = joined[-1] if joined else None
                 if last_one and offset - last_one[1] <= _GAP_BYTES and end - last_one[0] <= _JOINED_BYTES:
@@ -135,7 +134,7 @@ class RemoteFile:
         """The range ahead that has these bytes; it is forgotten with the last one that was announced."""
         with self._lock:
             for each in self._ahead:
-                if each.first <= offset and end <= each.end:
+                if _holds(each, offset, end):
                     each.waits -= 1
                     if not each.waits:
                         self._ahead.remove(each)
@@ -147,7 +146,7 @@ class RemoteFile:
         with self._lock:
             block, last_end = self._block, self._last_end
             self._last_end = end
-        if block is not None and block.first <= offset and end <= block.first + len(block.data):
+        if block is not None and _holds(block, offset, end):
             return block
         if not 0 <= offset - last_end <= _GAP_BYTES:
             return self._range(offset, end - offset)
@@ -158,11 +157,10 @@ class RemoteFile:
 
     def _longer_tail(self, opened: _Opened, offset: int) -> Answer:
         """The end of the object from an offset on, remembered: a long index, and what stands before it."""
-        head, tail = opened.ends
         first = max(0, offset - _GAP_BYTES)
-        more = self._range(first, tail.first - first)
-        longer = replace(tail, data=more.data + tail.data, first=first)
-        self._object = replace(opened, ends=(head, longer))
+        more = self._range(first, opened.tail.first - first)
+        longer = replace(opened.tail, data=more.data + opened.tail.data, first=first)
+        self._object = replace(opened, tail=longer)
         with _remembering:
             if _remembered.get(self._url) is opened:
                 _remembered[self._url] = self._object
@@ -174,12 +172,11 @@ class RemoteFile:
         if known is not None and time.monotonic() < known.until_s:
             return known
         asked = requests_for(self._url, timeout_s())
-        head = self._threads.submit(self._answer, asked, 0, _END_BYTES)
+        begun = self._threads.submit(self._answer, asked, 0, _END_BYTES)
         tail = self._answer(asked, None, _END_BYTES)
-        ends = (head.result(), tail)
-        if (ends[0].version, ends[0].size) != (tail.version, tail.size):
-            raise self._changed_error()
-        opened = _Opened(asked, tail.size, tail.version, ends, time.monotonic() + _REMEMBERED_S)
+        head = begun.result()
+        self._refuse_other(head, tail)
+        opened = _Opened(asked, head, tail, time.monotonic() + _REMEMBERED_S)
         with _remembering:
             _remembered[self._url] = opened
             _remembered.move_to_end(self._url)
@@ -189,15 +186,16 @@ class RemoteFile:
 
     def _range(self, first: int, length: int) -> Answer:
         answer = self._answer(self._object.requests, first, length)
-        if (answer.version, answer.size) != (self._object.version, self._object.size):
-            raise self._changed_error()
+        self._refuse_other(answer, self._object.tail)
         if (answer.first, len(answer.data)) != (first, length):
             raise SessionError(f"{self.path}: the server sent other bytes than those that were asked for")
         return answer
 
-    def _changed_error(self) -> SessionError:
-        forget(self.path)
-        return SessionError(f"{self.path}: was replaced while it was read; open it again")
+    def _refuse_other(self, answer: Answer, before: Answer) -> None:
+        """Raise SessionError where an answer is not of the same object as one before."""
+        if (answer.version, answer.size) != (before.version, before.size):
+            forget(self.path)
+            raise SessionError(f"{self.path}: was replaced while it was read; open it again")
 
     def _answer(self, asked: ObjectRequests, first: int | None, length: int) -> Answer:
         answer = ask_repeatedly(
@@ -205,6 +203,10 @@ class RemoteFile:
         )
         TRAFFIC.add(nbytes=len(answer.data))
         return answer
+
+
+def _holds(known: Answer | _Ahead, offset: int, end: int) -> bool:
+    return known.first <= offset and end <= known.end
 
 
 def forget(path: Path) -> None:
@@ -230,3 +232,53 @@ def _is_there(path: Path) -> bool:
     except MissingError:
         return False
     return True
+
+
+def is_listed(url: Path) -> bool:
+    """True if the folders of this server can be listed."""
+    return not str(url).startswith(("http://", "https://"))
+
+
+def objects_in(folder: UrlPath, begin: str = "") -> list[tuple[UrlPath, ListedObject]]:
+    """The objects of a folder in a bucket, in order of name, and what the listing says of each.
+
+    Parameters
+    ----------
+    begin : only those whose names begin so.
+
+    Raises
+    ------
+    SessionError : the folder can not be listed; MissingError if there is no such bucket, or access is refused.
+    """
+    if not is_listed(folder):
+        raise SessionError(f"{folder}: a server of http does not list its files; name the sessions one by one")
+    found = ask_repeatedly(folder, lambda limit_s: listing(str(folder), begin, limit_s))
+    return [(folder / each.name, each) for each in found]
+
+
+def files_at(place: UrlPath, suffixes: Sequence[str]) -> list[Path]:
+    """The files that a URL names: of a folder, or of a pattern such as `s3://lab/runs/*.mcap`; else itself.
+
+    Parameters
+    ----------
+    suffixes : of the files that are wanted; a URL that ends so is no folder.
+
+    Raises
+    ------
+    SessionError : the folder can not be listed, holds nothing, or a pattern is not in the last part of the URL.
+    """
+    if glob.has_magic(str(place.parent)):
+        raise SessionError(f"{place}: a pattern at a URL stands after its last slash, as in s3://lab/runs/*.mcap")
+    pattern = place.name if glob.has_magic(place.name) else ""
+    if not pattern and place.name.endswith(tuple(suffixes)):
+        return [place]
+    folder = place.parent if pattern else place
+    assert isinstance(folder, UrlPath)
+    found = [path for path, _ in objects_in(folder, pattern.partition("*")[0] if "[" not in pattern else "")]
+    if not found:
+        raise MissingError(f"{place}: no file is there; check the name, or name a folder in it")
+    return [
+        path
+        for path in found
+        if path.name.endswith(tuple(suffixes)) and (not pattern or fnmatch.fnmatchcase(path.name, pattern))
+    ]

@@ -9,23 +9,25 @@ NAME.partial                     any of these while it is written, or what a kil
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from flowrec.core import Outcome, SessionError, is_growing, seconds
-from flowrec.store.byte_source import is_there
+from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds
+from flowrec.store.byte_source import is_there, open_bytes
 from flowrec.store.mcap_reader import UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata
-from flowrec.store.session_path import UrlPath
+from flowrec.store.session_path import UrlPath, session_path
 
 SESSION_SUFFIX = ".mcap"
 PARTIAL_SUFFIX = ".partial"
 _ASKED, _PROBED, _OPENED = 8, 1000, 64  # parts at a URL: asked for at a time, by number at most, opened at a time
+_HASHED_BYTES = 4 << 20
 _NUMBERED = re.compile(r"(?P<stem>.+)\.(?P<kind>part|snap)(?P<number>\d{3,6})")
 
 
@@ -61,8 +63,7 @@ def run_files(path: Path) -> list[Path]:
 
 def _parts_at(path: UrlPath) -> list[Path]:
     """The parts of a run at a URL: those that the server lists, else those that follow each other."""
-    from flowrec.store.remote_file import are_there
-    from flowrec.store.remote_folder import is_listed, objects_in
+    from flowrec.store.remote_file import are_there, is_listed, objects_in
     from flowrec.store.traffic import MissingError
 
     folder = path.parent
@@ -94,11 +95,12 @@ def is_snapshot(path: Path) -> bool:
 
 def parts(path: Path) -> list[Path]:
     """The finished parts of the run X.mcap, in order."""
-    return _parts_among(run_files(path), path.suffix)
+    return _parts_among(run_files(path))
 
 
-def _parts_among(files: Sequence[Path], suffix: str) -> list[Path]:
-    return sorted((file for file in files if part_number(file) and file.suffix == suffix), key=part_number)
+def _parts_among(files: Iterable[Path]) -> list[Path]:
+    finished = (file for file in files if part_number(file) and not file.name.endswith(PARTIAL_SUFFIX))
+    return sorted(finished, key=part_number)
 
 
 def part_number(path: Path) -> int:
@@ -111,6 +113,27 @@ def _match_name(path: Path) -> tuple[Path, re.Match[str] | None]:
     """The file under its final name, and the parts of that name where it has a number."""
     complete = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
     return complete, _NUMBERED.fullmatch(complete.stem)
+
+
+def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
+    """Refuse the output X.mcap as `Output.check` does, and any file of that run, finished or not, in the same way.
+
+    Raises
+    ------
+    OutputError : as `Output.check`.
+    SessionError : the unfinished file of a killed run is there, which `overwrite` would remove.
+    """
+    there = run_files(path)
+    Output(path, MCAP, tuple(inputs), overwrite).check((*there, partial_path(path)))
+    if overwrite:
+        return
+    for file in there:
+        if not file.name.endswith(PARTIAL_SUFFIX):
+            raise name_taken(file)
+        raise SessionError(
+            f"{file}: is left from a run that did not finish; `flowrec recover {file}`"
+            " saves it, another --out or --overwrite records without it"
+        )
 
 
 _COUNTS = ("ticks", "dropped_frames", "frames_missing_from_camera")  # of an outcome: each part has its own
@@ -126,16 +149,13 @@ class RunFile:
     last_ns: int
     counts: Mapping[str, int]
     outcome: Mapping[str, str]
-    flowrec_version: str
     size_bytes: int
 
     @classmethod
     def of(cls, file: SessionMetadata) -> Self:
         """Description of an open file."""
-        statistics = file.statistics
-        first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
-        source, version = file.source, file.flowrec_version
-        return cls(source.path, file.part, first_ns, last_ns, file.counts, file.outcome, version, source.size)
+        times_ns = file.statistics.message_start_time, file.statistics.message_end_time
+        return cls(file.source.path, file.part, *times_ns, file.counts, file.outcome, file.source.size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +232,7 @@ def files_of(path: Path) -> list[Path]:
     if is_there(path):
         return [path]
     files = run_files(path)
-    found = _parts_among(files, path.suffix)
+    found = _parts_among(files)
     _refuse_unfinished(path, found, [file for file in files if file.name.endswith(PARTIAL_SUFFIX)])
     numbers = {part_number(file) for file in found}
     missing = next((number for number in range(1, max(numbers, default=0)) if number not in numbers), None)
@@ -288,3 +308,30 @@ def continuity_fault(file: RunFile, number: int, before: RunFile | None) -> str 
 def is_continued(outcome: Mapping[str, str]) -> bool:
     """True if the outcome of a part says that the run is continued in another part."""
     return Outcome.CONTINUED in (outcome.get("outcome"), outcome.get("ended_as"))
+
+
+def files_behind(path: Path) -> list[Path]:
+    """All files of a session and, if they are in the same folder, of the sessions that it replays.
+
+    An output that is made from the session must not replace any of them.
+    """
+    files: list[Path] = []
+    path = session_path(path)
+    while path not in files and not isinstance(path, UrlPath):  # no output of this machine is at a URL
+        files += [path, *run_files(path)]
+        # Errors in a file are reported by the code that reads it.
+        with contextlib.suppress(SessionError), SessionMetadata(files_of(path)[0]) as file:
+            path = path.with_name(Path(file.header.parent.get("file", "")).name or path.name)
+    return files
+
+
+def session_sha256(files: Sequence[Path]) -> str:
+    """SHA-256 of a session, by which a replay names its parent: of its file, or of its parts in order."""
+    digest = hashlib.sha256()
+    for path in files:
+        source = open_bytes(path)
+        with contextlib.closing(source):
+            for offset in range(0, source.size, _HASHED_BYTES):
+                source.prefetch((at, _HASHED_BYTES) for at in range(offset, offset + 4 * _HASHED_BYTES, _HASHED_BYTES))
+                digest.update(source.read(offset, min(_HASHED_BYTES, source.size - offset)))
+    return digest.hexdigest()

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema
+from mcap.records import ChunkIndex
 
 from flowrec.core import SessionError
+from flowrec.store.digest import message_digest
 from flowrec.store.mcap_format import (
     CHUNK_HEAD,
     CHUNK_LIMIT_BYTES,
@@ -24,7 +25,6 @@ from flowrec.store.mcap_format import (
     RECORD_HEAD,
     Record,
     Summary,
-    declare,
 )
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.session_metadata import CONFIG_FILE, OUTCOME
@@ -38,7 +38,7 @@ _SEQUENCES = 2**32
 _DECLARING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _TIMES_DECLARED = 2  # in the file and in its index
 
-Visit = Callable[[int, list[Record]], None]
+Visit = Callable[[ChunkIndex, list[Record]], None]
 
 
 class SequenceGap(NamedTuple):
@@ -58,46 +58,41 @@ class Scan:
     lost_bytes : skipped before the end of the run; a missing or damaged index after it is no loss.
     first_lost : offset of the first of them.
     gaps : by channel.
-    last_ns : time of the last message, by channel.
     ended : the outcome of the run was found, which is written after its last message.
     counts : number of messages by channel.
+    first, last : time of the first and the last message in the file and offset of its chunk, by channel.
+    sums : of the digests of the messages, by channel, where they are wanted.
     chunks_passed : that were not read, because only the declarations were wanted.
     """
 
+    _source: McapReader
+    _visit: Visit | None = None
+    _start_unix_ns: int | None = None  # as the index has it; None: no digests are wanted
     summary: Summary = field(default_factory=Summary)
     lost_bytes: int = 0
     first_lost: int = 0
     gaps: dict[int, list[SequenceGap]] = field(default_factory=dict)
-    last_ns: dict[int, int] = field(default_factory=dict)
     ended: bool = False
     counts: Counter[int] = field(default_factory=Counter)
+    first: dict[int, tuple[int, int]] = field(default_factory=dict)
+    last: dict[int, tuple[int, int]] = field(default_factory=dict)
+    sums: Counter[int] = field(default_factory=Counter)
     chunks_passed: int = 0
     _sequences: dict[int, int] = field(default_factory=dict)
 
-    def add(self, source: McapReader, visit: Visit | None, opcode: int, offset: int, length: int) -> bool:
+    def add(self, opcode: int, offset: int, length: int) -> bool:
         """Enter one record; False when it is damaged."""
+        source = self._source
         try:
             if opcode == Opcode.CHUNK:
-                self._add_chunk(source, visit, offset, length)
-            elif opcode == Opcode.SCHEMA:
+                self._add_chunk(offset, length)
+            elif opcode in _DECLARING:
+                found = source.record(offset, length, Opcode(opcode))
                 with source.parsing(offset):
-                    declare(self.summary.schemas, source.record(offset, length, Opcode.SCHEMA, Schema.read))
-            elif opcode == Opcode.CHANNEL:
-                with source.parsing(offset):
-                    declare(self.summary.channels, source.record(offset, length, Opcode.CHANNEL, Channel.read))
-            elif opcode == Opcode.METADATA:
-                metadata: Metadata = source.record(offset, length, Opcode.METADATA, Metadata.read)
-                self.summary.metadata.append(MetadataIndex(offset, length, metadata.name))
-                self.ended = self.ended or metadata.name == OUTCOME
-            elif opcode == Opcode.ATTACHMENT:
-                found = source.attachment_at(offset, length)
-                if found.name == CONFIG_FILE:
-                    with source.parsing(offset):
+                    if opcode == Opcode.ATTACHMENT and found.name == CONFIG_FILE:
                         source.set_start(found.log_time)
-                times, size = (found.log_time, found.create_time), len(found.data)
-                self.summary.attachments.append(
-                    AttachmentIndex(offset, length, *times, size, found.name, found.media_type)
-                )
+                    self.summary.enter(found, offset, length)
+                self.ended = self.ended or (opcode == Opcode.METADATA and found.name == OUTCOME)
         except SessionError:
             return False
         return True
@@ -118,58 +113,61 @@ class Scan:
         last_ns = max((chunk.message_end_time for chunk in summary.chunks), default=0)
         summary.count(self.counts, len(summary.chunks), first_ns, last_ns)
 
-    def _add_chunk(self, source: McapReader, visit: Visit | None, offset: int, length: int) -> None:
-        content = source.content(offset, length)
-        records = source.messages_in(content, offset)
+    def _add_chunk(self, offset: int, length: int) -> None:
+        content = self._source.content(offset, length)
+        records = self._source.messages_in(content, offset)
         if not records:
             return
-        self.summary.chunks.append(
-            ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=offset,
-                compression="zstd",
-                compressed_size=length,
-                # The times in the head of a chunk are under no checksum; those of its messages are.
-                message_end_time=max(record.log_ns for record in records),
-                message_index_length=0,
-                message_index_offsets={record.channel: 0 for record in records},
-                message_start_time=min(record.log_ns for record in records),
-                uncompressed_size=len(content),
-            )
+        place = ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=offset,
+            compression="zstd",
+            compressed_size=length,
+            # The times in the head of a chunk are under no checksum; those of its messages are.
+            message_end_time=max(record.log_ns for record in records),
+            message_index_length=0,
+            message_index_offsets={record.channel: 0 for record in records},
+            message_start_time=min(record.log_ns for record in records),
+            uncompressed_size=len(content),
         )
-        if visit is not None:
-            visit(offset, records)
-        for log_ns, channel, sequence, _ in records:
+        self.summary.chunks.append(place)
+        if self._visit is not None:
+            self._visit(place, records)
+        for log_ns, channel, sequence, payload in records:
             missing = (sequence - self._sequences.get(channel, -1) - 1) % _SEQUENCES
             if missing:
                 self.gaps.setdefault(channel, []).append(SequenceGap(log_ns, missing))
             self._sequences[channel] = sequence
             self.counts[channel] += 1
-            self.last_ns[channel] = max(log_ns, self.last_ns.get(channel, 0))
+            self.last[channel] = at = (log_ns, offset)
+            self.first.setdefault(channel, at)
+            if self._start_unix_ns is not None:
+                assert isinstance(payload, memoryview)
+                self.sums[channel] += message_digest(sequence, log_ns + self._start_unix_ns, payload)
 
 
 def scan(
     source: McapReader,
     visit: Visit | None = None,
     progress: Callable[[int], None] | None = None,
-    found: Scan | None = None,
     *,
+    digests: bool = False,
     heads_only: bool = False,
 ) -> Scan:
     """Read all of a file and index its intact records; one chunk is in memory at a time.
 
     Parameters
     ----------
-    visit : receives offset and messages of every intact chunk, in file order.
+    visit : receives place and messages of every intact chunk, in file order.
     progress : receives the byte up to which the file has been read.
-    found : an empty one, which is filled; where `visit` needs what was found before.
+    digests : sum up the digests of the messages.
     heads_only : pass over the content of chunks: only what is declared outside them is found.
 
     Raises
     ------
     SessionError : the file can not be read.
     """
-    found = Scan() if found is None else found
+    found = Scan(source, visit, source.start_unix_ns if digests else None)
     at = len(MAGIC)
     # What looks like a chunk after damage may be none, and overlap the next one: the cost of trying is bounded.
     allowance_bytes = _TRIES * source.size + _WINDOW_BYTES
@@ -185,7 +183,7 @@ def scan(
             found.chunks_passed += 1
             at = end
             continue
-        if end and found.add(source, visit, opcode, at, end - at):
+        if end and found.add(opcode, at, end - at):
             if opcode == Opcode.FOOTER:
                 break
             at = end

@@ -53,12 +53,11 @@ class Schema:
 @functools.cache
 def array_schema() -> Schema:
     """`flowrec.Array`: shape, numpy's name of the little-endian dtype, and the values in C order."""
-    file = descriptor_pb2.FileDescriptorProto(name=_ARRAY_FILE, package="flowrec", syntax="proto3")
-    message = file.message_type.add(name="Array")
+    file, message = _new("Array")
     message.field.add(name="shape", number=1, type=_Field.TYPE_UINT32, label=_Field.LABEL_REPEATED)
     message.field.add(name="dtype", number=2, type=_Field.TYPE_STRING, label=_Field.LABEL_OPTIONAL)
     message.field.add(name="data", number=ARRAY_DATA, type=_Field.TYPE_BYTES, label=_Field.LABEL_OPTIONAL)
-    return _add(file, "flowrec.Array")
+    return _add(file)
 
 
 def schema_of(message_type: type[Any], path: str = "") -> Schema:
@@ -66,10 +65,7 @@ def schema_of(message_type: type[Any], path: str = "") -> Schema:
 
     `path` : of an extra topic, whose type may be called like another one: its schema has a name and a pool of its own.
     """
-    name, package = message_type.__name__, "flowrec" + (".extra" + path.replace("/", ".") if path else "")
-    file_name = f"{package.replace('.', '/')}/{name}.proto"
-    file = descriptor_pb2.FileDescriptorProto(name=file_name, package=package, syntax="proto3")
-    message = file.message_type.add(name=name)
+    file, message = _new(message_type.__name__, "flowrec" + (".extra" + path.replace("/", ".") if path else ""))
     for number, form in enumerate(message_fields(message_type), 1):
         field = message.field.add(name=form.name, number=number, label=_Field.LABEL_OPTIONAL)
         if form.kind == "vector":
@@ -84,7 +80,7 @@ def schema_of(message_type: type[Any], path: str = "") -> Schema:
             if form.optional:  # proto3 declares presence as a one-of with a single member
                 field.proto3_optional, field.oneof_index = True, len(message.oneof_decl)
                 message.oneof_decl.add(name=f"_{form.name}")
-    return _add(file, f"{package}.{name}", alone=bool(path))
+    return _add(file, alone=bool(path))
 
 
 @functools.cache
@@ -101,18 +97,26 @@ def foxglove_schema(name: str) -> Schema:
 def plot_schema(name: str, numbers: Iterable[str], lists: Iterable[str] = ()) -> Schema:
     """`flowrec.NAME`: `timestamp` as in foxglove's schemas, then floats, and lists of floats."""
     foxglove_schema("Log")  # brings Timestamp
-    file = descriptor_pb2.FileDescriptorProto(name=f"flowrec/{name}.proto", package="flowrec", syntax="proto3")
+    file, message = _new(name)
     file.dependency.append(_TIMESTAMP_FILE)
-    message = file.message_type.add(name=name)
     stamp = message.field.add(name="timestamp", number=1, type=_Field.TYPE_MESSAGE, label=_Field.LABEL_OPTIONAL)
     stamp.type_name = ".google.protobuf.Timestamp"
     labels = [(each, _Field.LABEL_OPTIONAL) for each in numbers] + [(each, _Field.LABEL_REPEATED) for each in lists]
     for number, (each, label) in enumerate(labels, 2):
         message.field.add(name=each, number=number, type=_Field.TYPE_FLOAT, label=label)
-    return _add(file, f"flowrec.{name}")
+    return _add(file)
 
 
-def _add(file: descriptor_pb2.FileDescriptorProto, name: str, *, alone: bool = False) -> Schema:
+def _new(
+    name: str, package: str = "flowrec"
+) -> tuple[descriptor_pb2.FileDescriptorProto, descriptor_pb2.DescriptorProto]:
+    """A file with one message type, and that type, which has no field yet."""
+    file_name = f"{package.replace('.', '/')}/{name}.proto"
+    file = descriptor_pb2.FileDescriptorProto(name=file_name, package=package, syntax="proto3")
+    return file, file.message_type.add(name=name)
+
+
+def _add(file: descriptor_pb2.FileDescriptorProto, *, alone: bool = False) -> Schema:
     """The schema in a file; `alone`: in a pool of its own."""
     needed = [_files[each] for each in file.dependency]
     if alone:
@@ -123,9 +127,8 @@ def _add(file: descriptor_pb2.FileDescriptorProto, name: str, *, alone: bool = F
         pool = _pool
         _files[file.name] = file
     pool.Add(file)
-    return _schema(
-        name, descriptor_pb2.FileDescriptorSet(file=[*needed, file]).SerializeToString(deterministic=True), pool
-    )
+    data = descriptor_pb2.FileDescriptorSet(file=[*needed, file]).SerializeToString(deterministic=True)
+    return _schema(f"{file.package}.{file.message_type[0].name}", data, pool)
 
 
 def _schema(name: str, data: bytes, pool: descriptor_pool.DescriptorPool = _pool) -> Schema:

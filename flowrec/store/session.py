@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+import html
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -18,25 +20,28 @@ from flowrec.core import (
     nanoseconds,
     of_text,
     parse_toml,
+    printable,
     rows_for_people,
     seconds,
 )
-from flowrec.store.byte_source import open_bytes
 from flowrec.store.notes import Note, append_note, read_notes
-from flowrec.store.run_files import Run, files_of, run_files
+from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
-from flowrec.store.session_path import UrlPath, session_path
+from flowrec.store.session_path import session_path
 
 if TYPE_CHECKING:
+    import numpy as np
     import pyarrow as pa
+    from numpy.typing import NDArray
 
     from flowrec.core import Event, FlowField, Tick
     from flowrec.physics import Calibration, Chip
     from flowrec.stages import ResolvedConfig
-    from flowrec.store.frames import Frames
-    from flowrec.store.reader import SessionReader
+    from flowrec.store.reader import Frames, SessionReader
+    from flowrec.store.tables import Tables
 
-_HASHED_BYTES = 4 << 20
+_CARD_PX = 240  # width of the picture of a card
+_CARD_TEXT = 200  # characters of a value
 _LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
 
@@ -172,7 +177,7 @@ class Session:
         """All messages of one topic as an Arrow table, one row a message; `.to_pandas()` makes a DataFrame of it.
 
         Columns carry the unit in their names, and unit and meaning in the metadata of their fields; each table begins
-        with `stamp_ns`, `time_s` and `wall_time` (see tables/columns.py). It is as large as its content; `batches`
+        with `stamp_ns`, `time_s` and `wall_time` (see table_columns.py). It is as large as its content; `batches`
         reads the same in pieces. The table of "frame" has no images: `frames` has them.
 
         Parameters
@@ -183,31 +188,28 @@ class Session:
         ------
         SessionError : there is no such topic, or the file is damaged. UsageError if pyarrow is not installed.
         """
-        from flowrec.store.tables.arrow import table
-
         field = self.reader.field_of(topic)
-        rows, start_unix_ns = self.reader.rows([field]), self.header.start_unix_ns
-        return table(field, rows, start_unix_ns, self.reader.topics, self.reader.coils_of([field]))
+        return self._tables([field]).table(field, self.reader.rows([field]))
 
     def batches(self, topics: Sequence[str]) -> Iterator[tuple[str, pa.RecordBatch]]:
         """Field and next record batch of the tables of some topics, in one pass over the file; errors as of `table`."""
-        from flowrec.store.tables.arrow import batches
-
         fields = [self.reader.field_of(topic) for topic in topics]
-        rows, coils = self.reader.rows(fields), self.reader.coils_of(fields)
-        return batches(rows, self.header.start_unix_ns, self.reader.topics, coils)
+        return self._tables(fields).batches(self.reader.rows(fields))
 
     def schema(self, topic: str) -> pa.Schema:
         """The Arrow schema of the table of one topic; errors as of `table`."""
-        from flowrec.store.tables.arrow import schema_of
-
         field = self.reader.field_of(topic)
-        return schema_of(field, self.reader.topics, self.reader.coils_of([field]))
+        return self._tables([field]).schema(field)
+
+    def _tables(self, fields: Sequence[str]) -> Tables:
+        from flowrec.store.tables import Tables
+
+        return Tables(self.header.start_unix_ns, self.reader.topics, self.reader.coils_of(fields))
 
     @cached_property
     def frames(self) -> Frames:
         """The recorded camera images, in order: a sequence, of which `frames[i]` reads one image only."""
-        from flowrec.store.frames import Frames
+        from flowrec.store.reader import Frames
 
         return Frames(self.reader)
 
@@ -271,8 +273,6 @@ class Session:
 
     def _repr_html_(self) -> str:
         """A card for notebooks: how the run ended, with what, and the image in its middle, or the chip without one."""
-        from flowrec.store.session_card import card
-
         frames = self.frames
         image = frames[len(frames) // 2].image if len(frames) else self.chip.mask.astype("uint8")
         recorded = {name: self.provenance.get(name, "") for name in ("wall_time", "operator", "sample", "notes")}
@@ -298,21 +298,6 @@ def toml_table(text: str, where: str) -> dict[str, Any]:
         return parse_toml(text)
     except (ValueError, RecursionError) as error:  # also numbers and nesting that no flowrec has written
         raise SessionError(f"{where}: is not valid TOML ({error}); the file is damaged or was edited") from error
-
-
-def files_behind(path: Path) -> list[Path]:
-    """All files of a session and, if they are in the same folder, of the sessions that it replays.
-
-    An output that is made from the session must not replace any of them.
-    """
-    files: list[Path] = []
-    path = session_path(path)
-    while path not in files and not isinstance(path, UrlPath):  # no output of this machine is at a URL
-        files += [path, *run_files(path)]
-        # Errors in a file are reported by the code that reads it.
-        with contextlib.suppress(SessionError), SessionMetadata(files_of(path)[0]) as file:
-            path = path.with_name(Path(file.header.parent.get("file", "")).name or path.name)
-    return files
 
 
 @contextlib.contextmanager
@@ -359,13 +344,41 @@ def _absurd_numbers(session: Session) -> Iterator[str]:
         before = tick
 
 
-def session_sha256(files: Sequence[Path]) -> str:
-    """SHA-256 of a session, by which a replay names its parent: of its file, or of its parts in order."""
-    digest = hashlib.sha256()
-    for path in files:
-        source = open_bytes(path)
-        with contextlib.closing(source):
-            for offset in range(0, source.size, _HASHED_BYTES):
-                source.prefetch((at, _HASHED_BYTES) for at in range(offset, offset + 4 * _HASHED_BYTES, _HASHED_BYTES))
-                digest.update(source.read(offset, min(_HASHED_BYTES, source.size - offset)))
-    return digest.hexdigest()
+def card(title: str, rows: Iterable[tuple[str, str]], image: NDArray[np.uint8 | np.uint16] | None) -> str:
+    """HTML without scripts and links.
+
+    Parameters
+    ----------
+    rows : names and values, from a file, so not to be trusted.
+    image : (h, w) grey levels, which are stretched to the full range; None: no picture.
+    """
+    cells = "".join(
+        f'<tr><td style="text-align:left">{_escape(name)}</td><td style="text-align:left">{_escape(value)}</td></tr>'
+        for name, value in rows
+    )
+    picture = ""
+    if image is not None and image.size:
+        data = base64.b64encode(_thumbnail(image)).decode()
+        picture = f'<img alt="camera image" width="{_CARD_PX}" src="data:image/png;base64,{data}"/>'
+    return (
+        '<div style="display:flex;gap:1em;align-items:flex-start;border:1px solid #8888;border-radius:6px;padding:8px;'
+        f'max-width:52em">{picture}<div><b>{_escape(title)}</b><table>{cells}</table></div></div>'
+    )
+
+
+def _escape(text: str) -> str:
+    shown = printable(text)
+    return html.escape(shown if len(shown) <= _CARD_TEXT else shown[: _CARD_TEXT - 2] + " …")
+
+
+def _thumbnail(image: NDArray[np.uint8 | np.uint16]) -> bytes:
+    """A PNG as wide as the card shows it."""
+    import cv2
+    import numpy as np
+
+    scale = min(1.0, 2 * _CARD_PX / image.shape[1])  # sharp on screens with two pixels a point
+    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+    low, high = np.quantile(small, (0.001, 0.999))
+    grey = np.clip((small - low) / max(high - low, 1.0) * 255.0, 0, 255).astype(np.uint8)
+    return bytes(cv2.imencode(".png", grey)[1])

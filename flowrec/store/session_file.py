@@ -6,10 +6,9 @@ The options of a recording are here, because all files of a run are written with
 from __future__ import annotations
 
 import contextlib
-import errno
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,24 +18,25 @@ from mcap.records import Metadata
 
 from flowrec.core import (
     FIXED,
-    MCAP,
-    Output,
     SessionError,
     TopicTable,
     __version__,
     name_taken,
     put_in_place,
+    seconds,
     sync_directory,
 )
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
 from flowrec.store.mcap_format import SealedChunk
-from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.mcap_writer import FileError, disk_errors, new_mcap, not_writable
 from flowrec.store.roi import Region
-from flowrec.store.run_files import PARTIAL_SUFFIX, partial_path, run_files
+from flowrec.store.run_files import partial_path
 from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
 from flowrec.store.write_queue import Entry
+
+_POLL_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,77 +133,201 @@ class WriterOptions:
         return 0.5 * min(self.flush_s, self.sync_interval_s)
 
 
-class FileError(SessionError):
-    """A file that can not be written; the text names it and says what to do."""
-
-
 class SessionFile:
-    """A file that is named `PATH.partial` until it is complete, and then renamed in one step.
+    """A file of a run while it is recorded: named `PATH.partial` until it is complete, and then renamed in one step.
 
-    `sync` may run in another thread than the other methods.
+    Data older than `flush_s`, in wall time or in stamps, has been passed to the operating system. Data older than
+    `sync_s` is on the disk, as long as one fsync takes less than half of that. The fsync runs in a side thread: on a
+    busy disk it may take a second, in which a camera would fill the queue. That thread writes, too, what would delay
+    the caller: a keyframe, and with a `limit_bytes` all chunks. What is put later than that waits for it.
 
     Parameters
     ----------
     path : its name.
     header : is written first.
     options : of the recording.
+    limit_bytes : chunks are written by the side thread; `put` blocks while more bytes than this wait for it.
 
     Attributes
     ----------
-    failed : an error has occurred; `flowrec recover` reads what was written.
+    encoders : whose chunks go to this file.
+    flushed_ns : stamp up to which the operating system has all that was added; None before the first flush.
+    first_bytes : size of header and keyframe.
+    failure : the first error, after which nothing is written; `flowrec recover` reads what was written before.
+    completion : that of `complete` in another thread, once the file has received all that belongs into it.
 
     Raises
     ------
-    FileError : from any method, when the disk refuses.
+    FileError : from any method, when the disk refuses; what fails in the side thread is raised by `check`.
     """
 
-    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions) -> None:
+    def __init__(
+        self, path: Path, header: SessionHeader, options: WriterOptions, *, limit_bytes: int | None = None
+    ) -> None:
         self.path = path
         self.partial_path = partial_path(path)
-        self.failed = False
-        self._name_synced = False
+        self.encoders: list[ChunkEncoder] = []
+        self.flushed_ns: int | None = None
+        self.failure: BaseException | None = None
+        self.completion: Future[None] | None = None
         self._options = options
+        self._limit_bytes = limit_bytes
+        self._waiting_bytes = 0  # of chunks that the side thread is to write
+        self._written = threading.Condition()
+        self._writing: Future[None] | None = None  # the last of these
+        self._syncing: Future[None] | None = None
+        self._name_synced = False
+        self._synced_size = 0
+        self._since_ns: int | None = None  # stamp of the last flush, or of the first entry
+        self._last_ns = 0
+        self._side = ThreadPoolExecutor(1, "session-file")
         self._file = new_mcap(self.partial_path, overwrite=options.overwrite)
         try:
             self._write_head(header)
         except BaseException as error:
             self._file.close()
             if isinstance(error, OSError):
-                raise _not_writable(self.partial_path, error) from error
+                raise not_writable(self.partial_path, error) from error
             raise
-
-    def restart(self, header: SessionHeader) -> None:
-        """Write another header into a file that holds nothing but its header."""
-        with self._mark_failed():
-            self._file.clear()
-            self._write_head(header)
+        self._flushed_s = self._synced_s = options.clock()
 
     def _write_head(self, header: SessionHeader) -> None:
         options = self._options
         self._file.start(PROFILE, f"flowrec {__version__}")
         for record in (*header_records(header), *declarations(options.encoding, options.region, options.topics)):
             self._file.add(record)
+        self.first_bytes = self.size
+
+    def restart(self, header: SessionHeader) -> None:
+        """Write another header into a file that holds nothing but its header, and sync it."""
+        with self._mark_failed():
+            self._file.clear()
+            self._write_head(header)
+        self.sync_head()
+
+    def sync_head(self) -> None:
+        """Force the header to the disk, before anything else is put."""
+        try:
+            self._synced_size = self.size
+            self.sync()
+            self._synced_s = self._options.clock()
+        except BaseException:
+            self.close()
+            raise
+
+    def write_keyframe(self, encoder: ChunkEncoder, keyframe: Entry) -> None:
+        """Let the side thread write the first messages. It encodes them, too: large flow fields take long."""
+        encoder.sink = self.add_chunks
+
+        def write() -> None:
+            encoder.add(keyframe)
+            encoder.seal()
+            self.first_bytes = self.size
+
+        self._writing = self._aside(write)
 
     @property
     def size(self) -> int:
         """Bytes handed to the operating system."""
         return self._file.size
 
+    @property
+    def all_bytes(self) -> int:
+        """Bytes in the file and bytes that are not written yet, of which most are not compressed yet."""
+        return self.size + self._waiting_bytes + sum(encoder.size for encoder in self.encoders)
+
+    @property
+    def timeout_s(self) -> float | None:
+        """Time until `flush_if_due` has something to do, in s; None: not before the next entry."""
+        options = self._options
+        if self.is_writing:
+            return _POLL_S
+        if any(encoder.size for encoder in self.encoders):
+            return max(0.0, self._flushed_s + options.flush_interval_s - options.clock())
+        if self._synced_size < self.size:
+            # While the last fsync is still running there is nothing to do about the next one.
+            shortest = _POLL_S if self.is_syncing else 0.0
+            return max(shortest, self._synced_s + options.sync_interval_s - options.clock())
+        return None
+
+    @property
+    def is_writing(self) -> bool:
+        """True while the side thread has something to write."""
+        return self._writing is not None and not self._writing.done()
+
+    @property
+    def is_syncing(self) -> bool:
+        """True while an fsync is under way."""
+        return self._syncing is not None and not self._syncing.done()
+
+    def note(self, stamp_ns: int) -> None:
+        """Count the age of what is added to the encoders from this entry on."""
+        if self._since_ns is None:
+            self._since_ns = stamp_ns
+        self._last_ns = max(self._last_ns, stamp_ns)
+
+    def put(self, chunks: list[SealedChunk]) -> None:
+        """Write chunks, all in one write, behind what the side thread has to write."""
+        if self._limit_bytes is None and not self.is_writing:
+            self.check()
+            self.add_chunks(chunks)
+            return
+        own = copy_chunks(chunks)
+        with self._written:
+            if self._limit_bytes is not None:
+                limit_bytes = self._limit_bytes
+                self._written.wait_for(lambda: self.failure is not None or self._waiting_bytes <= limit_bytes)
+            self._waiting_bytes += _size_of(own)
+        self._writing = self._aside(self._write_waiting, own)
+
     def add_chunks(self, chunks: list[SealedChunk]) -> None:
-        """Append chunks, all in one write."""
+        """Write chunks at once."""
         with self._mark_failed():
             self._file.add_chunks(chunks)
 
+    def flush_if_due(self) -> None:
+        """Write and sync the data whose interval has passed."""
+        self.check()
+        options, stamps_s = self._options, seconds(self._last_ns - (self._since_ns or 0))
+        now = options.clock()
+        if now >= self._flushed_s + options.flush_interval_s or stamps_s >= options.flush_interval_s:
+            self.flush()
+        is_ready = not self.is_syncing and (self._limit_bytes is not None or not self.is_writing)
+        if is_ready and now >= self._synced_s + options.sync_interval_s and self._synced_size < self.size:
+            self.flush()
+            self._synced_s, self._synced_size = now, self.size
+            self._syncing = self._aside(self.sync)
+
+    def flush(self, *, wait: bool = False) -> None:
+        """Write all that was added; with `wait`, also what the side thread has to write."""
+        for encoder in self.encoders:
+            encoder.seal()
+        if wait and self._writing is not None:
+            futures.wait([self._writing])
+            self.check()
+        self._flushed_s = self._options.clock()
+        if self._since_ns is not None:
+            self._since_ns = self._last_ns
+            if not self.is_writing:
+                self.flushed_ns = self._last_ns
+
     def sync(self) -> None:
-        """Force what was appended to the disk."""
+        """Force what was written to the disk; may run in another thread than the other methods."""
         with self._mark_failed():
             self._file.sync()
             if not self._name_synced:
                 sync_directory(self.partial_path.parent)  # otherwise a power failure may leave the file without a name
                 self._name_synced = True
 
+    def check(self) -> None:
+        """Raise the first error."""
+        if self.failure is not None:
+            raise self.failure
+
     def complete(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
-        """Write outcome, colour scale of the views and summary, sync, and rename the file."""
+        """Write outcome, colour scale of the views and summary behind all else, sync, and rename the file."""
+        self._side.shutdown()
+        self.check()
         with self._mark_failed():
             if top_um_s is not None:
                 self._file.add(Metadata(VIEW, {"speed_scale_um_s": repr(top_um_s)}))
@@ -217,175 +341,44 @@ class SessionFile:
                 raise name_taken(self.path, f" (the finished session stays in {self.partial_path})") from error
 
     def close(self) -> None:
-        """Close the file without completing it."""
+        """Write what the side thread has to write, and close the file without completing it."""
+        self._side.shutdown()
         self._file.close()
 
     def encoding_failed(self, error: SessionError) -> FileError:
         """The error for a message that can not be stored."""
-        self.failed = True
-        return FileError(
+        self.failure = FileError(
             f"{self.path}: {error}; `flowrec recover {self.partial_path}` recovers what was recorded before it"
         )
+        return self.failure
+
+    def _aside(self, work: Callable[..., None], *arguments: list[SealedChunk]) -> Future[None]:
+        """Run a function in the side thread; `failure` receives its error."""
+
+        def run() -> None:
+            with self._mark_failed():
+                work(*arguments)
+
+        return self._side.submit(run)
+
+    def _write_waiting(self, chunks: list[SealedChunk]) -> None:
+        try:
+            if self.failure is None:
+                self.add_chunks(chunks)
+        finally:
+            with self._written:
+                self._waiting_bytes -= _size_of(chunks)
+                self._written.notify_all()
 
     @contextlib.contextmanager
     def _mark_failed(self) -> Iterator[None]:
         try:
             with disk_errors(self.partial_path):
                 yield
-        except BaseException:
-            self.failed = True
+        except BaseException as error:
+            self.failure = self.failure or error
             raise
 
 
-def new_mcap(path: Path, *, overwrite: bool) -> McapWriter:
-    """Begin a file; raises FileError where it can not be made."""
-    try:
-        return McapWriter(path, overwrite=overwrite)
-    except OSError as error:
-        raise _not_writable(path, error) from error
-
-
-@contextlib.contextmanager
-def disk_errors(path: Path) -> Iterator[None]:
-    """Turns an OSError of writing the file into a FileError that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        raise _disk_failed(path, error) from error
-
-
-def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
-    """Refuse the output X.mcap as `Output.check` does, and any file of that run, finished or not, in the same way.
-
-    Raises
-    ------
-    OutputError : as `Output.check`.
-    FileError : the unfinished file of a killed run is there, which `overwrite` would remove.
-    """
-    there = run_files(path)
-    Output(path, MCAP, tuple(inputs), overwrite).check((*there, partial_path(path)))
-    if overwrite:
-        return
-    for file in there:
-        if not file.name.endswith(PARTIAL_SUFFIX):
-            raise name_taken(file)
-        raise FileError(
-            f"{file}: is left from a run that did not finish; `flowrec recover {file}`"
-            " saves it, another --out or --overwrite records without it"
-        )
-
-
-def _not_writable(path: Path, error: OSError) -> FileError:
-    if isinstance(error, FileNotFoundError):
-        return FileError(f"{path.parent}: no such directory; make it, or choose another place with --out")
-    if isinstance(error, BlockingIOError):
-        return FileError(f"{path}: is being written by another process just now; choose another name with --out")
-    return FileError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
-
-
-def _disk_failed(path: Path, error: OSError) -> FileError:
-    if error.errno == errno.ENOENT:
-        return FileError(
-            f"{path}: no longer exists: the file or its directory was removed or renamed during the recording"
-        )
-    what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
-    return FileError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")
-
-
-class AsyncFileWriter(SessionFile):
-    """A session file that a background thread writes: chunks are queued and written in order.
-
-    Parameters
-    ----------
-    path, header, options : of the file.
-    limit_bytes : size of the queue; `put` blocks while it is full.
-
-    Attributes
-    ----------
-    finished : the file is complete.
-
-    Raises
-    ------
-    FileError : when the file can not be made; what fails later is raised by `check`.
-    """
-
-    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, *, limit_bytes: int) -> None:
-        super().__init__(path, header, options)
-        self.finished = False
-        self._limit_bytes = limit_bytes
-        self._synced_s, self._synced_size = options.clock(), 0
-        self._waiting_bytes = 0
-        self._written = threading.Condition()
-        self._failure: BaseException | None = None
-        self._last: Future[None] | None = None
-        self._thread = ThreadPoolExecutor(1, "session-snapshot")
-
-    def put_keyframe(self, encoder: ChunkEncoder, entry: Entry) -> None:
-        """Write the keyframe. The thread encodes it, too, because that may take as long as writing it."""
-        encoder.sink = self.add_chunks
-
-        def encode() -> None:
-            encoder.add(entry)
-            encoder.seal()
-
-        self._submit(encode)
-
-    def put(self, chunks: list[SealedChunk]) -> None:
-        """Append chunks."""
-        for chunk in copy_chunks(chunks):
-            with self._written:
-                self._written.wait_for(lambda: self._failure is not None or self._waiting_bytes <= self._limit_bytes)
-                self._waiting_bytes += len(chunk.data)
-            self._submit(self._write, chunk)
-
-    def sync_if_due(self) -> None:
-        """Sync what was written, also if no other chunk follows."""
-        if self._last is not None and self._last.done():
-            self._submit(self._sync)
-
-    def finish(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
-        """Complete the file when all has been written."""
-
-        def finish() -> None:
-            self.complete(outcome, top_um_s)
-            self.finished = True
-
-        self._submit(finish)
-
-    def check(self, *, wait: bool = False) -> None:
-        """Raise the error of the thread, if any; with `wait`, after all has been written."""
-        if wait and self._last is not None:
-            futures.wait([self._last])
-        if self._failure is not None:
-            raise self._failure
-
-    def close(self) -> None:
-        """Write what is queued, and close the file without completing it."""
-        self._thread.shutdown()
-        super().close()
-
-    def _submit(self, work: Callable[..., None], *arguments: SealedChunk) -> None:
-        """Run a function in the thread, unless an earlier one has failed."""
-
-        def run() -> None:
-            try:
-                if self._failure is None:
-                    work(*arguments)
-            except BaseException as error:  # noqa: BLE001  `check` raises it
-                self._failure = error
-            finally:
-                with self._written:
-                    self._waiting_bytes -= sum(len(chunk.data) for chunk in arguments)
-                    self._written.notify_all()
-
-        self._last = self._thread.submit(run)
-
-    def _write(self, chunk: SealedChunk) -> None:
-        self.add_chunks([chunk])
-        self._sync()
-
-    def _sync(self) -> None:
-        now, size = self._options.clock(), self.size
-        if now >= self._synced_s + self._options.sync_interval_s and self._synced_size < size:
-            self.sync()
-            self._synced_s, self._synced_size = now, size
+def _size_of(chunks: list[SealedChunk]) -> int:
+    return sum(len(chunk.data) for chunk in chunks)

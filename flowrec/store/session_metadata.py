@@ -204,6 +204,10 @@ class SessionMetadata:
         return self
 
     def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; a forgotten one is closed when it is collected."""
         self.source.close()
 
     @functools.cached_property
@@ -214,6 +218,10 @@ class SessionMetadata:
         self._limit("attachments", (index.length for index in wanted), _ATTACHMENTS_LIMIT_BYTES)
         files = {index.name: self.source.attachment(index) for index in wanted}
         records = self._records()
+
+        def files_with(prefix: str) -> dict[str, bytes]:
+            return {name.removeprefix(prefix): data for name, data in files.items() if name.startswith(prefix)}
+
         try:
             return SessionHeader(
                 config_toml=files[CONFIG_FILE].decode(),
@@ -221,14 +229,10 @@ class SessionMetadata:
                 chip_toml=files[CHIP_FILE].decode(),
                 provenance=records[PROVENANCE],
                 parent=records.get(PARENT, {}),
-                weights={
-                    name.removeprefix(_WEIGHTS): data for name, data in files.items() if name.startswith(_WEIGHTS)
-                },
+                weights=files_with(_WEIGHTS),
                 part=self.part,
                 start_unix_ns=self.source.start_unix_ns,
-                pictures={
-                    name.removeprefix(_PICTURES): data for name, data in files.items() if name.startswith(_PICTURES)
-                },
+                pictures=files_with(_PICTURES),
             )
         except KeyError as error:
             raise self.source.damage_error(0, f"the record {error} is missing") from error

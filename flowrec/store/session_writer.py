@@ -12,8 +12,7 @@ from flowrec.physics import Chip, chip_files
 from flowrec.stages import SIMULATED, ResolvedConfig, calibration_of, facts_of, to_toml, topics_of
 from flowrec.store.frame_encodings import encoding_for
 from flowrec.store.roi import Region
-from flowrec.store.run_files import files_of
-from flowrec.store.session import files_behind, session_sha256
+from flowrec.store.run_files import files_behind, files_of, session_sha256
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.store.writer import SessionWriter
@@ -50,15 +49,14 @@ def session_writer(
     topics : those of the run; None: those that the settings name.
     """
     header = session_header(config, chip)
-    if derived:
-        header = replace(header, provenance={**header.provenance, "derived": json.dumps(dict(derived))})
-    if facts:
-        header = replace(header, provenance={**header.provenance, **facts})
+    more = {"derived": json.dumps(dict(derived))} if derived else {}
+    more |= {**(facts or {}), **_durability(config, live=live)}
+    header = replace(header, provenance={**header.provenance, **more})
     if parent is not None:
         files = files_of(parent)
-        named = {"file": parent.name, "sha256": session_sha256(files)}
-        header = replace(header, parent=named, start_unix_ns=_start_unix_ns(files[0]))
-    header = replace(header, provenance={**header.provenance, **_durability(config, live=live)})
+        with SessionMetadata(files[0]) as first:
+            named = {"file": parent.name, "sha256": session_sha256(files)}
+            header = replace(header, parent=named, start_unix_ns=first.source.start_unix_ns)
     options = WriterOptions(
         frames=frames_of(config),
         flush_s=config.recording.flush_s,
@@ -84,11 +82,6 @@ def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
     bytes_s, flush_s = image_bytes_s(config), config.recording.flush_s
     waiting_s = queue_bytes_of(config) / bytes_s if live and bytes_s else 0.0  # only if the disk is too slow
     return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
-
-
-def _start_unix_ns(file: Path) -> int:
-    with SessionMetadata(file) as head:
-        return head.source.start_unix_ns
 
 
 def _files_of(config: ResolvedConfig) -> Split | Snapshot:

@@ -24,24 +24,20 @@ class TransientError(Exception):
     """A failure that may not come again: no connection, a time limit, a server in trouble, a body that was cut."""
 
 
-class RefusedError(Exception):
-    """A failure that the same request will meet again."""
-
-
-class AbsentError(RefusedError):
-    """There is no such object, or this user may not know of it."""
-
-
-class ForbiddenError(AbsentError):
-    """Access to the object is refused to this user."""
-
-
 class MissingError(SessionError):
     """No object of that name can be read: there is none, or access is refused."""
 
 
 class HiddenError(MissingError):
     """Access to the object is refused."""
+
+
+class RefusedError(Exception):
+    """A failure that the same request will meet again; `kind` of error is raised for it."""
+
+    def __init__(self, text: str, kind: type[SessionError] = SessionError) -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 @dataclass(slots=True)
@@ -114,12 +110,8 @@ def ask_repeatedly(
         TRAFFIC.add(requests=1, repeated=reason)
         try:
             return ask(max(0.1, end_s - time.monotonic()))
-        except ForbiddenError as error:
-            raise HiddenError(f"{path}: {error}") from error
-        except AbsentError as error:
-            raise MissingError(f"{path}: {error}") from error
         except RefusedError as error:
-            raise SessionError(f"{path}: {error}") from error
+            raise error.kind(f"{path}: {error}") from error
         except TransientError as error:
             pause_s, reason = _PAUSE_S * 2.0**number, str(error)
             if number == _TRIES - 1 or time.monotonic() + pause_s > end_s or not wanted():

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 from flowrec.core import NS_PER_S
+from flowrec.store.frame_encodings import FrameEncoding
 from flowrec.store.roi import Window
 
 NewMessages = dict[str, Any]  # the new messages of one tick by field of Tick, in the order of the topic table
@@ -43,6 +45,43 @@ class Entry(NamedTuple):
     dropped: int = 0
     missing: int = 0
     window: Window | None = None
+
+
+@dataclass(slots=True)
+class Counters:
+    """Counts of the ticks and images of one segment, or of several together."""
+
+    ticks: int = 0
+    dropped_frames: int = 0
+    missing_frames: int = 0
+    images: int = 0
+    windows: int = 0  # images of which only a window was recorded
+
+    def add(self, entry: Entry) -> None:
+        """Count one entry."""
+        self.ticks += entry.ticks
+        self.dropped_frames += entry.dropped
+        self.missing_frames += entry.missing
+        self.images += "frame" in entry.messages
+        self.windows += entry.window is not None
+
+    def include(self, other: Counters) -> None:
+        """Add other counters."""
+        for name in (counter.name for counter in fields(self)):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+    def summary(self, encoding: FrameEncoding) -> dict[str, str]:
+        """The entries that every outcome has besides its reason."""
+        counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
+        if self.missing_frames:
+            counts["frames_missing_from_camera"] = str(self.missing_frames)
+        if self.windows:
+            counts["frames_windows"] = (
+                f"{self.windows} of {self.images} images hold what the tracker read, and are black elsewhere"
+            )
+        if not encoding.lossless:
+            counts["frames_encoding"] = f"{encoding.name}, not lossless: a replay sees other pixels"
+        return counts
 
 
 class WriteQueue:

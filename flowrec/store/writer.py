@@ -30,7 +30,6 @@ from flowrec.core import (
     Priority,
     SessionError,
     Tick,
-    Track,
     array_fields,
     nanoseconds,
     prioritise_thread,
@@ -39,11 +38,11 @@ from flowrec.core import (
 )
 from flowrec.store.channels import FRAME_PATH
 from flowrec.store.ring_buffer import RingBuffer
-from flowrec.store.roi import Window, WindowSelector
-from flowrec.store.run_files import run_files
-from flowrec.store.session_file import Snapshot, WriterOptions, refuse_if_taken
+from flowrec.store.roi import WindowSelector
+from flowrec.store.run_files import refuse_if_taken, run_files
+from flowrec.store.segments import Parts
+from flowrec.store.session_file import Snapshot, WriterOptions
 from flowrec.store.session_metadata import SessionHeader
-from flowrec.store.split import Parts
 from flowrec.store.write_queue import Entry, FrameDecimation, NewMessages, WriteQueue
 
 _NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
@@ -96,10 +95,8 @@ class SessionWriter:
         self.path = Path(path)
         self.ticks = self.dropped_frames = self.missing_frames = 0
         self.remarks: deque[str] = deque()
-        options = options or WriterOptions()
+        self._options = options = options or WriterOptions()
         self._block = options.block
-        self._keep_failed = options.keep_failed
-        self._start_by_clocks = options.start_by_clocks
         self._flush_ns = nanoseconds(options.flush_s)
         self._decimation = FrameDecimation()
         self._selector = WindowSelector(options.region) if options.region is not None else None
@@ -111,8 +108,8 @@ class SessionWriter:
         self._last_ns = -1
         self._failure: BaseException | None = None
         self._closed = False
-        self._topics, self._extra = options.topics, NO_EXTRA
-        self._left_out = [topic.field for topic in self._topics.topics if topic.path in options.left_out_topics]
+        self._extra = NO_EXTRA
+        self._left_out = [topic.field for topic in options.topics.topics if topic.path in options.left_out_topics]
         refuse_if_taken(self.path, overwrite=options.overwrite, inputs=inputs)
         # Only what was there before this run may be removed after it.
         self._replaced = {file: file.stat().st_ino for file in run_files(self.path)} if options.overwrite else {}
@@ -179,21 +176,14 @@ class SessionWriter:
         self.ticks += ticks
         for field in self._left_out:
             new.pop(field, None)
-        if self._block:
-            frame = new.get("frame")
-            window = self._window_of(frame, tick.track) if isinstance(frame, Frame) else None
-            entry = Entry(tick.stamp_ns, new, sum(map(_nbytes, new.values())), ticks, window=window)
-            if not self._queue.has_room(entry.nbytes):
-                self._queue.wait_for_room(entry.nbytes)
-                self._raise_failure()
-            self._queue.put(entry)
-            return
-        frame = new.pop("frame", None)
         dropped, missing = self.dropped_frames, self.missing_frames
-        image: Entry | None = None
-        if isinstance(frame, Frame) and self._takes(frame):
-            window = self._window_of(frame, tick.track)
-            image = Entry(tick.stamp_ns, {"frame": frame}, _nbytes(frame), late=True, window=window)
+        # A run that waits for its disk records every image, with the rest of its tick.
+        frame = new.get("frame") if self._block else new.pop("frame", None)
+        window, image = None, None
+        if isinstance(frame, Frame) and (self._block or self._takes(frame)):
+            window = self._selector.window_of(frame, tick.track) if self._selector is not None else None
+            if not self._block:
+                image = Entry(tick.stamp_ns, {"frame": frame}, _nbytes(frame), late=True, window=window)
         self._add_drops(new, tick.stamp_ns)
         entry = Entry(
             tick.stamp_ns,
@@ -203,7 +193,11 @@ class SessionWriter:
             image_bytes=image.nbytes if image is not None else 0,
             dropped=self.dropped_frames - dropped,
             missing=self.missing_frames - missing,
+            window=window if self._block else None,
         )
+        if self._block and not self._queue.has_room(entry.nbytes):
+            self._queue.wait_for_room(entry.nbytes)
+            self._raise_failure()
         self._queue.put(entry, image)
 
     def close(self, outcome: Mapping[str, str] | None = None, timeout_s: float | None = None, *, why: str = "") -> None:
@@ -257,7 +251,7 @@ class SessionWriter:
         if error is None:
             self.close()
             return
-        if not self._keep_failed:
+        if not self._options.keep_failed:
             self.discard()
             return
         stopped = isinstance(error, KeyboardInterrupt)
@@ -291,17 +285,13 @@ class SessionWriter:
             before = last.get(path)
             if message is before or (before is not None and message.same_as(before)):
                 continue
-            topic = self._topics.by_path.get(path)
+            topic = self._options.topics.by_path.get(path)
             if topic is None or type(message) is not topic.type:
                 kind = type(message).__name__
                 raise SessionError(f"{self.path}: no topic {path} of {kind} is declared; name its row in `topics`")
             if fault := shape_error(message):  # of a package: what is written can be read
                 raise SessionError(f"{self.path}: {path}: {fault}")
             new[path] = message
-
-    def _window_of(self, frame: Frame, track: Track | None) -> Window | None:
-        """The window of an image that is recorded; None: all of it."""
-        return self._selector.window_of(frame, track) if self._selector is not None else None
 
     def _takes(self, frame: Frame) -> bool:
         """True if there is room for an image of a live run; counts those that are missing."""
@@ -330,12 +320,13 @@ class SessionWriter:
         if self._block and sys.platform == "linux":  # only there has each thread a priority of its own
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        begin_by_clocks = self._options.start_by_clocks
         try:
             while not self._queue.drained:
                 entry = self._queue.take(self._output.timeout_s)
                 if entry is not None:
-                    if self._start_by_clocks:
-                        self._start_by_clocks = False
+                    if begin_by_clocks:
+                        begin_by_clocks = False
                         self._begin_at_clocks(entry)
                     self._output.add(entry)
                 if entry is None and self._queue.flush_wanted:

@@ -150,7 +150,7 @@ def test_the_observed_flow_has_a_row_for_each_observation_and_is_read_back_as_it
 
 
 def test_a_persons_table_without_deviations_counts_each_at_a_twentieth_of_the_usual_speed() -> None:
-    from flowrec.store.tables.observed import observations_of
+    from flowrec.store.table_columns import observations_of
 
     table = {"x_um": [1.0, 2.0], "y_um": [3.0, 4.0], "u_um_s": [30.0, 0.0], "v_um_s": [40.0, 50.0]}  # 50 um/s each
     np.testing.assert_allclose(observations_of(table).std_um_s, 2.5)

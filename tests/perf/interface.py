@@ -20,7 +20,7 @@ import typer
 import flowrec
 from flowrec.core import declarations, enums, methods, topics
 from flowrec.stages import config
-from flowrec.store.tables import columns
+from flowrec.store import table_columns as columns
 from flowrec.verbs import cli
 
 

@@ -14,9 +14,8 @@ from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEA
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.session_file import SessionFile, Snapshot, Split, WriterOptions
 from flowrec.store.session_metadata import DIGEST, OUTCOME, VIEW
-from flowrec.store.split import PartFile
 from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_damage import names_in
@@ -45,7 +44,7 @@ def files(tmp_path_factory):
     for name, options in RUNS.items():
         folder = tmp_path_factory.mktemp("copies")
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(PartFile, "flush_if_due", flush_every(3))
+            patch.setattr(SessionFile, "flush_if_due", flush_every(3))
             with SessionWriter(folder / "s.mcap", HEADER, options) as writer:
                 for tick in ticks_of(40, shape=(8, 8)):
                     writer.write(tick)

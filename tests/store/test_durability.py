@@ -26,8 +26,8 @@ from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
+from flowrec.store.segments import Parts
 from flowrec.store.session_file import Split, WriterOptions
-from flowrec.store.split import Parts
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
 from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S
@@ -198,7 +198,7 @@ def test_a_run_that_waits_for_its_disk_is_never_more_than_flush_s_ahead_of_it(tm
             writer.write(tick)
             # As a kill would find it now.
             with contextlib.closing(McapReader(writer.partial_path)) as source:
-                held_ns = scan(source).last_ns.get(SLOTS["/robot/track"].channel, TICKS_BEGIN_NS)
+                held_ns = scan(source).last.get(SLOTS["/robot/track"].channel, (TICKS_BEGIN_NS,))[0]
             ahead_s.append(seconds(tick.stamp_ns - held_ns))
     assert 0.0 < max(ahead_s) <= 0.5
 
@@ -385,16 +385,17 @@ def test_with_the_shipped_settings_a_power_cut_costs_a_second_on_the_slowest_dis
     options = WriterOptions(flush_s=recording.flush_s, sync_s=recording.sync_s, clock=lambda: now_s[0])
     parts = Parts(tmp_path / "s.mcap", HEADER, options, Split(), "run")
     monkeypatch.setattr(McapWriter, "sync", slow)
-    part = parts._router.current.segment
+    file = parts.open[-1].file
     kept_ns, asked, lost_s, syncs = TICKS_BEGIN_NS, None, [], 0
     for tick in ticks_of(400, shape=(8, 8)):  # 6.7 s
         parts.add(Entry(tick.stamp_ns, {"track": tick.track, "truth": tick.truth}, 500, 1))
         parts.flush_if_due()
-        if asked is None and part._sync_running:  # for what the operating system has now
+        if asked is None and file.is_syncing:  # for what the operating system has now
             asked = parts.flushed_ns, now_s[0] + 0.49
         elif asked is not None and now_s[0] >= asked[1]:
             done.release()
-            part._join_sync()
+            while file.is_syncing:
+                time.sleep(1e-4)
             kept_ns, asked, syncs = asked[0], None, syncs + 1
         lost_s.append(seconds(tick.stamp_ns - kept_ns))
         now_s[0] += seconds(PERIOD_NS)

@@ -20,8 +20,7 @@ from flowrec.store.mcap_reader import McapReader
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.split import PartFile
+from flowrec.store.session_file import SessionFile, WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.compare import compare
@@ -38,7 +37,7 @@ def small(tmp_path_factory):
     """A made-up session of many chunks: three ticks a flush."""
     path = tmp_path_factory.mktemp("recovery") / "small.mcap"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PartFile, "flush_if_due", flush_every(3))
+        patch.setattr(SessionFile, "flush_if_due", flush_every(3))
         with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
             for tick in TICKS:
                 writer.write(tick)
@@ -52,7 +51,7 @@ def flush_every(ticks):
     def flush_if_due(self):
         self.calls = getattr(self, "calls", 0) + 1
         if self.calls % ticks == 0:
-            self._flush()
+            self.flush()
 
     return flush_if_due
 

@@ -17,8 +17,8 @@ from flowrec.stages.config import load_config
 from flowrec.stages.resolve import resolve
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover_run
-from flowrec.store.run_files import part_path, partial_path, parts, run_files, run_path, snapshot_path
-from flowrec.store.session import Session, session_sha256
+from flowrec.store.run_files import part_path, partial_path, parts, run_files, run_path, session_sha256, snapshot_path
+from flowrec.store.session import Session
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import Part
 from flowrec.store.session_writer import session_header

@@ -29,8 +29,8 @@ from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.run_files import part_path, run_files
 from flowrec.store.scan import scan
+from flowrec.store.segments import Parts
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.split import Parts
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
 from flowrec.store.writer import SessionWriter
@@ -144,7 +144,7 @@ def test_a_part_whose_beginning_is_larger_than_a_part_still_gets_as_much_again(t
 def test_a_part_counts_the_images_that_still_wait_for_it_until_they_have_come(tmp_path):
     split = Split(megabytes=0.2)
     parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, frames="raw"), split, "run")
-    first = parts._router.open[0]
+    first = parts.open[0]
     ticks = list(ticks_of(12, shape=(200, 200)))
     image = {tick.stamp_ns: Entry(tick.stamp_ns, {"frame": tick.frame}, 40_000, late=True) for tick in ticks}
     for tick in ticks[:4]:
@@ -325,6 +325,6 @@ def test_the_operating_system_has_a_part_before_the_next_one_begins_though_image
     parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, flush_s=100.0), split, "run")
     for tick in TICKS[:30]:
         parts.add(Entry(tick.stamp_ns, {"track": tick.track}, 500, ticks=1, image_bytes=64))
-    first, second = parts._router.open
-    assert first.awaited and first.segment.flushed_ns == second.keyframe_ns
+    first, second = parts.open
+    assert first.awaited and first.file.flushed_ns == second.keyframe_ns
     parts.close()

@@ -371,7 +371,7 @@ def _last_ns(disk: Disk, folder: Path) -> int:
     """Stamp of the last tick that the disk is sure to have."""
     (folder / "flushed.mcap").write_bytes(disk.flushed("s.mcap.partial"))
     with contextlib.closing(McapReader(folder / "flushed.mcap")) as source:
-        return scan(source).last_ns.get(SLOTS["/robot/track"].channel, 0)
+        return scan(source).last.get(SLOTS["/robot/track"].channel, (0,))[0]
 
 
 def _until(happened: Callable[[], bool]) -> None:

@@ -15,7 +15,7 @@ from flowrec.core.messages import FlowField
 from flowrec.physics.chip.chip import Chip, ChipSettings
 from flowrec.physics.chip.io import load_chip
 from flowrec.physics.flow.sampling import sample
-from flowrec.store.tables.observed import OBSERVED, observations_of
+from flowrec.store.table_columns import OBSERVED, observations_of
 
 GOLDEN = Path(__file__).parents[3] / "sessions" / "golden.mcap"
 

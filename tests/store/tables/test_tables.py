@@ -17,8 +17,8 @@ from flowrec.core.topics import BY_FIELD, TOPICS, Tick
 from flowrec.core.units import unit_of
 from flowrec.store.session import Session
 from flowrec.store.session_file import WriterOptions
-from flowrec.store.tables.arrow import batches, schema_of
-from flowrec.store.tables.columns import columns_of
+from flowrec.store.table_columns import columns_of
+from flowrec.store.tables import Tables
 from flowrec.store.writer import SessionWriter
 from tests.store.drafts import made_up
 from tests.store.hostile import STATE, file_of, with_message
@@ -38,7 +38,7 @@ def rows_of(topic: str, messages: list[Any]) -> list[dict[str, Any]]:
     names = [each.name for each in message_fields(BY_FIELD[topic].type)]
     cells = [[getattr(message, name) for name in names] for message in messages]
     plain = [[tuple(c) if isinstance(c, np.ndarray) and c.ndim == 1 else c for c in row] for row in cells]
-    found = list(batches(((topic, tuple(row)) for row in plain), 10**18))
+    found = list(Tables(10**18).batches((topic, tuple(row)) for row in plain))
     return [row for _, batch in found for row in batch.to_pylist()]
 
 
@@ -129,10 +129,10 @@ def test_the_table_of_the_images_has_the_stamp_of_each_without_reading_one(monke
 
 def test_every_column_has_a_meaning_and_the_unit_that_its_name_ends_in() -> None:
     for topic in TOPICS:
-        for field in schema_of(topic.field):
+        for field in Tables(0).schema(topic.field):
             assert field.metadata[b"meaning"], f"{topic.field}.{field.name}"
             assert field.metadata[b"unit"].decode() == unit_of(field.name)
-        names = schema_of(topic.field).names
+        names = Tables(0).schema(topic.field).names
         assert len(set(names)) == len(names)
     meanings = {each.name: each.meaning for each in message_fields(Estimate)}
     assert meanings["flow_um_s"] == "the disturbance: flow velocity at the robot"

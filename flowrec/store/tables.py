@@ -1,0 +1,198 @@
+"""Rows of messages, flow fields and observations -> Arrow tables: typed columns whose metadata state unit and meaning.
+
+The rows come from `SessionReader.rows`. A batch has at most some thousand rows and some 8 MB, so a session of
+any length is streamed. https://arrow.apache.org/docs/python/data.html#record-batches
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import (
+    FIXED,
+    NS_PER_S,
+    VALUES,
+    FlowField,
+    Observations,
+    SessionError,
+    TopicTable,
+    UsageError,
+    message_fields,
+    unit_of,
+    values_of,
+)
+from flowrec.store.table_columns import OBSERVED, STAMP, TIME, WALL, Column, columns_of
+
+try:
+    import pyarrow as pa
+except ModuleNotFoundError as error:
+    raise UsageError("tables need pyarrow, which is not installed: pip install 'flowrec[export]'") from error
+
+_ROWS = 4096
+_BATCH_BYTES = 8 << 20  # an export holds some five times as much: columns, copies, and the pages of its writer
+
+
+class Tables:
+    """The tables of a session.
+
+    Parameters
+    ----------
+    start_unix_ns : Unix time of stamp 0; 0: not known, and no row has a time of day.
+    topics : those of the session.
+    coils : their number in the session.
+    """
+
+    def __init__(self, start_unix_ns: int, topics: TopicTable = FIXED, coils: int = 3) -> None:
+        self._start_unix_ns, self._topics, self._coils = start_unix_ns, topics, coils
+
+    def schema(self, topic: str) -> pa.Schema:
+        """The Arrow schema of a topic's table; each field's metadata has `unit` and `meaning`, the table's `topic`."""
+        fields = [
+            pa.field(column.name, _type_of(column), metadata={"unit": column.unit, "meaning": column.meaning})
+            for column in columns_of(topic, self._topics, self._coils)
+        ]
+        return pa.schema(fields, metadata={"topic": self._topics.by_field[topic].path})
+
+    def table(self, topic: str, rows: Iterable[tuple[str, tuple[Any, ...]]]) -> pa.Table:
+        """The rows of one topic as a table."""
+        return pa.Table.from_batches([batch for _, batch in self.batches(rows)], self.schema(topic))
+
+    def batches(self, rows: Iterable[tuple[str, tuple[Any, ...]]]) -> Iterator[tuple[str, pa.RecordBatch]]:
+        """The rows of several topics as record batches of each, in order.
+
+        Parameters
+        ----------
+        rows : topic, by its field of `Tick`, and row.
+
+        Raises
+        ------
+        SessionError : a message has another number of coils.
+        """
+        waiting: dict[str, list[tuple[Any, ...]]] = {}
+        nbytes: dict[str, int] = {}
+        for topic, row in rows:
+            held = waiting.setdefault(topic, [])
+            held.append(row)
+            nbytes[topic] = nbytes.get(topic, 0) + sum([cell.nbytes for cell in row if isinstance(cell, np.ndarray)])
+            if len(held) == _ROWS or nbytes[topic] > _BATCH_BYTES:
+                yield topic, self._batch(topic, waiting.pop(topic))
+                nbytes[topic] = 0
+        for topic, held in waiting.items():
+            yield topic, self._batch(topic, held)
+
+    def _batch(self, topic: str, rows: Collection[tuple[Any, ...]]) -> pa.RecordBatch:
+        declared, columns = self._topics.by_field[topic], columns_of(topic, self._topics, self._coils)
+        names = [each.name for each in message_fields(declared.type)]
+        cells = dict(zip(names, zip(*rows, strict=True), strict=True))
+        stamps = np.fromiter(cells[STAMP], np.int64, len(rows))
+        arrays, flat = [], dict[str, NDArray[Any]]()
+        for column in columns:
+            if column.name == STAMP:
+                array = pa.array(stamps)
+            elif column.name == TIME:
+                array = pa.array(stamps / NS_PER_S)
+            elif column.name == WALL:
+                none = np.full(len(rows), not self._start_unix_ns)
+                array = pa.array((stamps + self._start_unix_ns).view("datetime64[ns]"), _type_of(column), mask=none)
+            elif column.component is not None:
+                if column.field not in flat:
+                    width = sum(other.field == column.field for other in columns)
+                    if {len(cell) for cell in cells[column.field]} != {width}:
+                        what = f"{declared.path}: {column.field}"
+                        raise SessionError(f"{what} has not {width} numbers in each message, one a coil")
+                    flat[column.field] = _flat(cells[column.field], column.kind).reshape(len(rows), width)
+                array = pa.array(np.ascontiguousarray(flat[column.field][:, column.component]))
+            elif column.shape:
+                array = _lists(column, cells[column.field])
+            else:
+                array = pa.array(cells[column.field], _type_of(column))
+            arrays.append(array)
+        return pa.RecordBatch.from_arrays(arrays, schema=self.schema(topic))
+
+
+def _type_of(column: Column) -> pa.DataType:
+    kind = pa.timestamp("ns", "UTC") if column.kind == "timestamp" else pa.type_for_alias(column.kind)
+    for length in reversed(column.shape):
+        kind = pa.list_(kind, length) if isinstance(length, int) else pa.list_(kind)
+    return kind
+
+
+def _flat(cells: tuple[Any, ...], kind: str) -> NDArray[Any]:
+    """All elements of vectors or arrays one after the other; a vector is a tuple."""
+    if cells and isinstance(cells[0], tuple):
+        return np.fromiter(itertools.chain.from_iterable(cells), kind)
+    return np.concatenate([np.ravel(cell) for cell in cells]) if cells else np.zeros(0, kind)
+
+
+def _lists(column: Column, cells: tuple[Any, ...]) -> pa.Array:
+    """Arrays of one number of dimensions and of any shape, None among them, as nested lists without a copy a number."""
+    there = [cell for cell in cells if cell is not None]
+    shapes = np.array([(len(cell),) if isinstance(cell, tuple) else cell.shape for cell in there], np.int64)
+    axes = len(column.shape)
+    shapes = shapes.reshape(len(there), axes)  # also where there is none
+    values = pa.array(_flat(tuple(there), column.kind))
+    for axis in reversed(range(1, axes)):  # from the innermost lists to those of which a row has one
+        length = column.shape[axis]
+        if isinstance(length, int):
+            values = pa.FixedSizeListArray.from_arrays(values, length)
+        else:
+            counts = np.prod(shapes[:, :axis], axis=1)  # how many lists each row has on this level
+            lengths = np.repeat(shapes[:, axis], counts)
+            values = pa.ListArray.from_arrays(_offsets(lengths), values)
+    missing = np.array([cell is None for cell in cells])
+    outer = column.shape[0]
+    if isinstance(outer, int):
+        assert not missing.any()  # see columns.py
+        return pa.FixedSizeListArray.from_arrays(values, outer)
+    lengths = np.zeros(len(cells), np.int64)
+    lengths[~missing] = shapes[:, 0]
+    mask = pa.array(missing) if missing.any() else None
+    return pa.ListArray.from_arrays(_offsets(lengths), values, mask=mask)
+
+
+def _offsets(lengths: NDArray[np.int64]) -> pa.Array:
+    return pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
+
+
+def observed_flow(observations: Observations) -> pa.Table:
+    """Observations with a row each, in the columns OBSERVED; what is not stated is empty."""
+    n = len(observations.position_um)
+    none = np.full((n, 2), np.nan)
+    rolled = observations.rolled_um_s if observations.rolled_um_s is not None else none
+    time_s = observations.time_s if observations.time_s is not None else none[:, 0]
+    parts = (observations.position_um, observations.flow_um_s, observations.std_um_s[:, None], rolled, time_s[:, None])
+    empty = {
+        "own_u_um_s": observations.rolled_um_s is None,
+        "own_v_um_s": observations.rolled_um_s is None,
+        "time_s": observations.time_s is None,
+    }
+    return _table(OBSERVED, np.hstack(parts), empty)
+
+
+def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
+    """A flow field with a row for each pixel of fluid.
+
+    Parameters
+    ----------
+    fluid : (h, w), where the chip holds fluid.
+    """
+    return _table(VALUES, values_of(field, fluid), dict.fromkeys(("std_u_um_s", "std_v_um_s"), field.std_um_s is None))
+
+
+def _table(columns: Mapping[str, str], values: NDArray[Any], empty: Mapping[str, bool]) -> pa.Table:
+    schema = pa.schema(
+        [
+            pa.field(name, pa.float64(), metadata={"unit": unit_of(name), "meaning": text})
+            for name, text in columns.items()
+        ]
+    )
+    arrays = [
+        pa.nulls(len(values), pa.float64()) if empty.get(name) else pa.array(np.ascontiguousarray(values[:, number]))
+        for number, name in enumerate(columns)
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
