@@ -1,7 +1,7 @@
 from .check import check as check
 from .cli import main as main
 from .command import MisuseError as MisuseError, Told as Told, verb as verb
-from .listed import (
+from .listing import (
     ALWAYS as ALWAYS, LISTS as LISTS, ListedSession as ListedSession, TEXT_LIMIT as TEXT_LIMIT,
     columns_for_people as columns_for_people, columns_of as columns_of, text_of_list as text_of_list, kind_of as kind_of,
 )
@@ -12,7 +12,7 @@ from .options import (
 )
 from .preparation import prepare as prepare, refuse_adrift as refuse_adrift
 from .replay_change import Change as Change, FIXED as FIXED
-from .replay_report import refinement_remarks as refinement_remarks, refly as refly
+from .replay_made import refinement_remarks as refinement_remarks, refly as refly
 from .report_page import HTML as HTML, require_packages as require_packages
 from .session_replay import replay_session as replay_session
 from .session_table import (

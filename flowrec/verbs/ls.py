@@ -8,7 +8,7 @@ import typer
 
 from flowrec.store import session_path
 from flowrec.verbs.command import verb
-from flowrec.verbs.listed import ListedSession, columns_for_people, is_doubtful
+from flowrec.verbs.listing import ListedSession, columns_for_people, is_doubtful
 
 
 class Listing(list[ListedSession]):
