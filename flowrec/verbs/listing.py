@@ -6,7 +6,6 @@ Reads heads and indexes only, however large the sessions are. A choice is an SQL
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -37,6 +36,7 @@ from flowrec.store import (
     run_path,
 )
 from flowrec.verbs.info import info
+from flowrec.verbs.options import unknown_name
 
 _TOGETHER = 16  # sessions at URLs that are read at a time
 NAMES = (SESSION_SUFFIX, SESSION_SUFFIX + PARTIAL_SUFFIX)  # ends of the names of sessions, finished or not
@@ -237,14 +237,6 @@ def columns_of(listed: ListedSession, path: str) -> dict[str, Any]:
 def text_of_list(texts: Iterable[str]) -> str:
     """The texts of a list as an expression sees them."""
     return ", ".join(texts)
-
-
-def unknown_name(option: str, name: str, names: Iterable[str], what: str = "no session states") -> str:
-    """The complaint about a name that no column has."""
-    known = sorted(names)
-    near = difflib.get_close_matches(name, known, 3, 0.5)
-    meant = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known)}"
-    return f"{option}: {what} {name}; {meant}"
 
 
 def columns_for_people(rows: Sequence[ListedSession], width: int) -> tuple[list[str], list[list[str]]]:
