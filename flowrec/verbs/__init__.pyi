@@ -1,7 +1,7 @@
 from .check import check as check
 from .cli import main as main
 from .command import MisuseError as MisuseError, Told as Told, verb as verb
-from .listing import (
+from .listed import (
     ALWAYS as ALWAYS, LISTS as LISTS, ListedSession as ListedSession, TEXT_LIMIT as TEXT_LIMIT,
     columns_for_people as columns_for_people, columns_of as columns_of, text_of_list as text_of_list, kind_of as kind_of,
 )

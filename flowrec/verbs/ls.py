@@ -2,18 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from flowrec.store import session_path
 from flowrec.verbs.command import verb
-
-if TYPE_CHECKING:
-    from flowrec.verbs.listing import ListedSession
+from flowrec.verbs.listed import ListedSession, columns_for_people, is_doubtful
 
 
-class Listing(list["ListedSession"]):
+class Listing(list[ListedSession]):
     """Sessions as rows; `places` are those that were asked for."""
 
     places: Sequence[Path]
@@ -25,7 +23,6 @@ class Listing(list["ListedSession"]):
     def show(self) -> None:
         """Print the rows as a table, and why some can not be read."""
         from flowrec.core import say, table, width
-        from flowrec.verbs.listing import columns_for_people, is_doubtful
 
         doubtful = [number for number, row in enumerate(self) if is_doubtful(row)]
         title = ", ".join(map(str, self.places))

@@ -1,10 +1,9 @@
-"""Options that several verbs have, what is wrong with their values, and how the help lists commands."""
+"""Options that several verbs have, and how the help lists commands."""
 
 from __future__ import annotations
 
-import difflib
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Union
@@ -122,11 +121,3 @@ class Stoppable:
 def from_above(name: str) -> Any:
     """A verb of ABOVE."""
     return pkgutil.resolve_name(ABOVE[name])
-
-
-def unknown_name(option: str, name: str, names: Iterable[str], what: str = "no session states") -> str:
-    """The complaint about a name that no column has."""
-    known = sorted(names)
-    near = difflib.get_close_matches(name, known, 3, 0.5)
-    meant = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known)}"
-    return f"{option}: {what} {name}; {meant}"

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flowrec.core import UsageError
-from flowrec.verbs.options import unknown_name
+from flowrec.verbs.listed import unknown_name
 
 try:
     import duckdb

@@ -21,7 +21,7 @@ from flowrec.core.terminal import Progress
 from flowrec.run.control import RunControl
 from flowrec.verbs import replay_segments
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.listing import columns_for_people
+from flowrec.verbs.listed import columns_for_people
 from flowrec.verbs.ls import ls
 
 ROOT = Path(__file__).parents[2]

@@ -31,7 +31,7 @@ from flowrec.core.system.outputs import OutputError
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.cli import app
-from flowrec.verbs.listing import columns_of
+from flowrec.verbs.listed import columns_of
 from flowrec.verbs.ls import ls
 from tests.conftest import HANG_S
 from tests.extras import needs
