@@ -4,7 +4,6 @@ from .layout import write_layouts as write_layouts
 from .report import style as style
 from .report.curves import Span as Span
 from .report.explanations import GLOSSARY as GLOSSARY, MEANINGS as MEANINGS, sentence as sentence
-from .report.history import Remark as Remark
 from .report.map_figure import ChangeFigure as ChangeFigure, MapFigure as MapFigure
 from .report.motion_figure import MotionFigure as MotionFigure
 from .report.observer_figure import ObserverFigure as ObserverFigure

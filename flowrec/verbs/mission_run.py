@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
 
-from flowrec.console import Console, RunEnded, refuse_without_packages
+from flowrec.console import RunEnded, refuse_without_packages
 from flowrec.core import (
     DOUBTS,
     MCAP,
@@ -18,7 +16,6 @@ from flowrec.core import (
     ClockMonitor,
     Coverage,
     Figures,
-    FlowrecError,
     Outcome,
     Output,
     SessionError,
@@ -30,7 +27,6 @@ from flowrec.core import (
     say,
     warn,
 )
-from flowrec.physics import Chip
 from flowrec.rigs import Connecting, MovieRig, Picturing, Rig
 from flowrec.run import (
     DiskMonitor,
@@ -49,8 +45,6 @@ from flowrec.stages import (
     MOVIE,
     RIGS,
     Config,
-    Pipeline,
-    ResolvedConfig,
     RunStatistics,
     extra_rows,
 )
@@ -67,10 +61,7 @@ from flowrec.verbs.preparation import (
     prepare,
 )
 from flowrec.verbs.run_summary import GOOD_ENDS, Recorded, figures_of, files_text, judge_refinement, judges_of
-
-if TYPE_CHECKING:
-    from flowrec.view import LiveView
-
+from flowrec.verbs.watching import Watching
 
 # Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
 CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
@@ -359,66 +350,3 @@ def _close_in_thread(opened: list[SessionWriter], reason: str) -> str:
 def _report_remarks(writer: SessionWriter) -> None:
     while writer.remarks:
         say(writer.remarks.popleft())
-
-
-class Watching:
-    """Context in which a run is shown; both parts may be absent, and the console needs a live view for its Rerun."""
-
-    def __init__(
-        self,
-        view: View,
-        scene: tuple[ResolvedConfig, Chip, Pipeline, Path],
-        control: RunControl | None,
-        remarks: Callable[[], dict[str, Any]],
-    ) -> None:
-        """Start what is asked for.
-
-        Parameters
-        ----------
-        scene : settings, chip and pipeline of the run, and the path of its session.
-        control : what the console steers; None: no console.
-        remarks : what the console shows besides ticks; asked in another thread.
-        """
-        self._live: LiveView | None = None
-        self._console: Console | None = None
-        live = view in ("spawn", "serve")
-        if not live and control is None:
-            return
-        # Imported here because importing Rerun takes a second and most runs do not need it.
-        from flowrec.exports import scene_of
-        from flowrec.view import LiveView
-
-        shown = scene_of(*scene)
-        self._live = LiveView(shown, "spawn" if view == "spawn" else "serve")
-        if live:
-            say(self._live.message)
-        if control is not None:
-            camera = scene[0].camera
-            shown = replace(shown, image_px=(camera.width_px, camera.height_px))
-            port = self._live.port if self._live.pid is not None else None
-            self._console = Console(control, shown, scene[3].name, port, remarks, say)
-            say(self._console.message)
-            if self._console.tunnel:
-                say(self._console.tunnel)
-
-    @property
-    def sinks(self) -> list[Sink]:
-        """Sinks that show the ticks."""
-        return [sink for sink in (self._live, self._console) if sink is not None]
-
-    def close(self, ended: RunEnded, timeout_s: float | None = None) -> None:
-        """Let the pages show how the run ended and where its file is; end what nobody watches any more."""
-        limit = {} if timeout_s is None else {"timeout_s": timeout_s}
-        if self._console is not None:  # first: its browsers are viewers of the live view's server
-            self._console.close(ended, **limit)
-        if self._live is not None:
-            self._live.close(**limit)
-            if self._live.afterwards:
-                say(self._live.afterwards)
-                self._live.afterwards = ""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, _kind: object, error: BaseException | None, _traceback: object) -> None:
-        self.close(RunEnded(f"failed: {error}" if isinstance(error, FlowrecError) else "failed"))

@@ -24,8 +24,8 @@ from flowrec.stages.config import load_config
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_writer import session_header
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.mission_run import Watching
 from flowrec.verbs.preparation import prepare
+from flowrec.verbs.watching import Watching
 
 PAGE = """
 import sys
