@@ -3,6 +3,10 @@
 The images of the camera pass through the whole pipeline, the writer and the disk of the session, at the camera's rate,
 for some seconds. Nothing is energised, and what was written is removed. Besides, the process of the slow stages has
 then done the first order of the mission: it has imported, compiled and factorised what that needs.
+
+Before that comes a rehearsal: a short simulated mission, in memory, that compiles and imports what a run will need. The
+first run of an installation compiles for half a minute. A live run that did so while its camera delivers would lose the
+images of that time; what is compiled stays in the cache of kernels.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Preparation of a run before its rig is touched: a resolved configuration, and a mission that is feasible."""
+"""Preparation of a run before its rig is touched: its files, its resolved settings, and a mission that is feasible."""
 
 from __future__ import annotations
 
