@@ -67,7 +67,8 @@ class FileCheck:
 
     def _begin(self, found: Audit) -> None:
         """Take the head, before the first message."""
-        self.found, header, quality = found, found.header, None
+        self.found, header = found, found.header
+        quality: TrackQuality | None = None
         try:
             if header is not None:
                 config = self._config = config_from_toml(header.config_toml, "its configuration", header.provenance)

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, PICTURE, Frame, Image, Output, UsageError, say, seconds, shift_px
+from flowrec.core import NS_PER_S, PICTURE, Frame, Image, Output, Track, UsageError, say, seconds, shift_px
 from flowrec.rigs import MovieSource
 from flowrec.stages import (
     MOST,
@@ -155,7 +155,7 @@ def _within(source: MovieSource, prepared: Prepared) -> Iterator[Frame]:
 def _look_through(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> tuple[Floats, MovieTracks | None]:
     """Shifts (n, 2) of all images in px, (0, 2) if they can not be measured; the robot's track, None without a log."""
     quality = TrackQuality(p.calibration, p.image_shape, p.robot)
-    sight, seen, shifts = Sight(), [], list[Floats]()
+    sight, seen, shifts = Sight(), list[Track](), list[Floats]()
     # The shift is measured, too, where it is not taken out of the track.
     stabilised, measures = bool(p.stabiliser.on), replace(p.stabiliser, on=True)
     shift, background = None, None
