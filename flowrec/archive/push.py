@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -85,11 +85,7 @@ class Pushed:
 
     def as_json(self) -> dict[str, Any]:
         """All facts by name."""
-        names = ("size_bytes", "sent_bytes", "sha256", "compared")
-        objects = [
-            {"file": str(each.file), "url": str(each.url)} | {name: getattr(each, name) for name in names}
-            for each in self.files
-        ]
+        objects = [asdict(each) | {"file": str(each.file), "url": str(each.url)} for each in self.files]
         failed = [{"session": str(path), "error": text} for path, text in self.failed.items()]
         return {"target": self.target, "objects": objects, "failed": failed, "repeated_requests": TRAFFIC.repeated}
 
@@ -110,7 +106,8 @@ def push(sessions: Sequence[Path], target: str) -> Pushed:
     """
     bucket, pushed = Bucket(_folder(target)), Pushed(target)
     files: dict[Path, list[Path]] = {}
-    for path in map(_local, sessions):
+    for session in sessions:
+        path = on_this_machine(session, "nothing is pushed from")
         try:
             files[path] = _files(path)
         except SessionError as error:
@@ -148,10 +145,6 @@ def _folder(target: str) -> UrlPath:
     if folder.suffix == ".mcap":
         raise UsageError(f"{target}: name a folder, as in s3://lab/runs; a session keeps its name")
     return folder
-
-
-def _local(session: Path) -> Path:
-    return on_this_machine(session, "nothing is pushed from")
 
 
 def _files(session: Path) -> list[Path]:

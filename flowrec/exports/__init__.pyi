@@ -8,7 +8,6 @@ from .report.curve_figures import (
 )
 from .report.curves import Span as Span
 from .report.explanations import GLOSSARY as GLOSSARY, MEANINGS as MEANINGS, sentence as sentence
-from .report.history import Remark as Remark
 from .report.map_figure import ChangeFigure as ChangeFigure, MapFigure as MapFigure
 from .report.page import (
     Drawn as Drawn, Folded as Folded, Page as Page, ReplayPart as ReplayPart, ReportFigure as ReportFigure,

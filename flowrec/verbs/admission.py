@@ -3,13 +3,17 @@
 The images of the camera pass through the whole pipeline, the writer and the disk of the session, at the camera's rate,
 for some seconds. Nothing is energised, and what was written is removed. Besides, the process of the slow stages has
 then done the first order of the mission: it has imported, compiled and factorised what that needs.
+
+Before that comes a rehearsal: a short simulated mission, in memory, that compiles and imports what a run will need. The
+first run of an installation compiles for half a minute. A live run that did so while its camera delivers would lose the
+images of that time; what is compiled stays in the cache of kernels.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,19 +22,24 @@ from flowrec.core import (
     MCAP,
     FlowField,
     Output,
+    Progress,
     RigError,
     Tick,
+    UsageError,
+    kernels_cached,
     nanoseconds,
     realtime_priority,
+    say,
     seconds,
     temporary_name,
     warn,
 )
-from flowrec.physics import Chip
-from flowrec.rigs import Rig, Tried
-from flowrec.run import RunControl, Worker
-from flowrec.stages import Pipeline, ResolvedConfig, step
+from flowrec.physics import Chip, load_chip
+from flowrec.rigs import Rig, SimulatedRig, Tried
+from flowrec.run import LockstepWorker, RunControl, Worker, run
+from flowrec.stages import Config, Pipeline, ResolvedConfig, assemble, load_config, resolve, step
 from flowrec.store import SessionWriter, session_writer
+from flowrec.verbs.interactive import Unattended
 
 _ENOUGH = 0.95  # of the camera's rate: the rest is what two seconds can tell
 _TRIES = 3  # a moment without the processor is no lack of it
@@ -199,3 +208,78 @@ def _trial(
     # One image less than the ticks: the time begins with the first.
     written = ticks - 1 - writer.dropped_frames - waiting
     return Held(asked_hz, (ticks - 1) / (ticked_s - begin_s), written / written_s, granted)
+
+
+# Seconds of session: survey, refinement, plan and the way to the goal take seven. One that gets lost ends here.
+LENGTH_S = 15.0
+_ADOPT_AFTER_S = 0.1
+_SETTINGS = {
+    "chip.name": "straight",
+    "camera.width_px": 96,
+    "camera.height_px": 77,
+    "camera.rate_hz": 15.0,
+    "robot.radius_um": 70.0,
+    "robot.max_speed_um_s": 900.0,
+    "simulated.world": "kind",
+    "simulated.seed": 5,
+    "refine.assimilate.doubt_depth": False,
+    "recording.disk_floor_gb": 0.0,
+}
+_ON_THE_ROBOT_PX = (15, 38)  # column, row of these images, at the start
+
+
+def rehearse(config: Config, stopped: Callable[[], object] = lambda: False, progress: Progress | None = None) -> None:
+    """Fly a short mission with the methods of a configuration, as fast as it goes and without a file.
+
+    Parameters
+    ----------
+    stopped : asked after every tick; the rehearsal ends when it says so.
+    progress : takes the seconds of session so far, of `LENGTH_S`.
+
+    Raises
+    ------
+    FlowrecError : a method of the configuration can not be used here.
+    """
+    progress = progress if progress is not None else Progress()
+    small = _small(config)
+    chip = load_chip(small.chip)
+    resolved = resolve(small, chip)
+    pipeline = assemble(resolved, chip)
+    control = RunControl()
+
+    def on_tick(tick: Tick) -> None:
+        progress(tick.stamp_ns / 1e9)
+        if tick.mission is not None:
+            progress.stage(tick.mission.phase)
+        if stopped():
+            control.stop("stopped")
+
+    worker = LockstepWorker(pipeline, _ADOPT_AFTER_S)
+    run(pipeline, SimulatedRig.of(pipeline, resolved, LENGTH_S), worker, [], control=control, on_tick=on_tick)
+
+
+def rehearse_aloud(config: Config, control: Unattended) -> None:
+    """Rehearse with progress; a stop of the run does not wait for it."""
+    if not kernels_cached():
+        say("compiling the numerics, once after an installation: about half a minute")
+    run_control = control.run_control
+    with control.progress("getting ready", LENGTH_S) as progress:
+        run_control.unless_stopped(lambda: rehearse(config, lambda: run_control.reason, progress), None)
+
+
+def _small(config: Config) -> Config:
+    """The settings of the rehearsal: those that choose a kernel are the run's."""
+    sets = _SETTINGS | {
+        "camera.bits": config.camera.bits,
+        "observer.method": config.observer.method,
+        "survey.method": config.survey.method,
+        "plan.method": config.plan.method,
+        "plan.cost": config.plan.cost,
+        "control.method": config.control.method,
+    }
+    if config.tracker.click_px is not None or config.tracker.box_px is not None:
+        sets["tracker.click_px"] = _ON_THE_ROBOT_PX
+    try:
+        return load_config(None, sets)
+    except UsageError:  # settings that go together only with others of the run
+        return load_config(None, _SETTINGS)

@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,9 +33,15 @@ from flowrec.measure import (
 from flowrec.physics import AS_STATED
 from flowrec.rigs import MovieSource, session_of_log, with_exported
 from flowrec.stages import MOVIE, Config, is_of_session, read_coil_log
-from flowrec.verbs.axes import may_be_image, motion_by_log, orientation_of_heading, turned_log
 from flowrec.verbs.first_pass import Looked, first_pass
-from flowrec.verbs.misfit import why_still, why_unexplained
+from flowrec.verbs.misfit import (
+    may_be_image,
+    motion_by_log,
+    orientation_of_heading,
+    turned_log,
+    why_still,
+    why_unexplained,
+)
 from flowrec.verbs.preparation import Prepared
 
 _FAR = 0.3  # relative difference of um_per_rev from which it is doubtful whether the log is of this run
@@ -72,26 +76,14 @@ def asked_import(
     return asked
 
 
-class Fitted(NamedTuple):
-    """A configuration fitted to what its movie shows; facts for the head of the session; doubts; the run, prepared."""
-
-    asked: Config
-    facts: Mapping[str, str]
-    doubts: list[str]
-    prepared: Prepared
-
-
-def fit_import(asked: Config, folder: Path, robot: str = "", *, align: bool = True) -> Fitted:
+def fit_import(asked: Config, folder: Path, robot: str = "", *, align: bool = True) -> Looked:
     """Look through the movie once: which body is the robot, and how the clock of the log lies to that of the movie.
 
     Parameters and errors are those of `import_movie`; a picture of the candidates goes into `folder`.
     """
     fits = align and bool(asked.movie.coils) and not on_one_clock(asked)
     looked = first_pass(asked, overlapping(asked) if fits else asked, robot, folder)
-    if not fits:
-        return Fitted(looked.asked, looked.facts, refuse_turned(looked), looked.prepared)
-    asked, found, doubts = align_log(looked)
-    return Fitted(asked, {**looked.facts, **found}, doubts, looked.prepared)
+    return align_log(looked) if fits else looked._replace(doubts=refuse_turned(looked))
 
 
 def refuse_turned(looked: Looked) -> list[str]:
@@ -102,7 +94,7 @@ def refuse_turned(looked: Looked) -> list[str]:
     config, tracks, image = looked.prepared.config, looked.tracks, looked.prepared.image
     if tracks is None or image is None:  # None: mission.check_axes is off
         return []
-    found = motion_by_log(tracks.stamps_ns, tracks.positions_um, tracks.log, config)
+    found = motion_by_log(tracks, config)
     if found.verdict == AxesVerdict.CONTRADICTS:
         raise turned_log(found.orientation, image, config, looked.prepared.chip)
     text = f"{config.movie.coils}: the axes of the log are not confirmed: the motion of the robot tells too little"
@@ -119,8 +111,8 @@ def _refuse_doubtful(fit: MotionFit, prepared: Prepared) -> None:
     warn(f"the robot moves {found.name}, relative to the log, whose axes are adapted: {image.text}")
 
 
-def align_log(looked: Looked) -> tuple[Config, Mapping[str, str], list[str]]:
-    """The configuration with the clock of the log as the motion shows it, the fit for the head of the session, doubts.
+def align_log(looked: Looked) -> Looked:
+    """What is known, with the clock of the log as the motion shows it, the fit for the head of the session, doubts.
 
     Raises
     ------
@@ -142,10 +134,10 @@ def align_log(looked: Looked) -> tuple[Config, Mapping[str, str], list[str]]:
     if fit.refusal:
         refusal = fit.refusal
         if UNEXPLAINED in refusal:
-            why = why_unexplained(tracks.evidence, log, flow, rough.robot.um_per_rev)
+            why = why_unexplained(tracks, flow, rough.robot.um_per_rev)
             refusal = refusal.replace(UNEXPLAINED, why)
         else:
-            refusal = why_still(tracks.evidence, log, rough.robot.um_per_rev) or refusal
+            refusal = why_still(tracks, rough.robot.um_per_rev) or refusal
         raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {refusal}; or {_WITHOUT}")
     _refuse_doubtful(fit, looked.prepared)
     movie = rough.movie
@@ -171,8 +163,9 @@ def align_log(looked: Looked) -> tuple[Config, Mapping[str, str], list[str]]:
             f"(movie.between_rows = 'linear') and the clock is known to {1e3 * fit.offset_std_s:.0f} ms, which costs "
             "the flow some percent, so log every command"
         )
-    facts = figures_of(fit) | {"um_per_rev_stated": stated, "um_per_rev_used": robot.um_per_rev}
-    return replace(asked, movie=changed, robot=robot), {"alignment": json.dumps(facts)}, doubts
+    figures = figures_of(fit) | {"um_per_rev_stated": stated, "um_per_rev_used": robot.um_per_rev}
+    facts = {**looked.facts, "alignment": json.dumps(figures)}
+    return looked._replace(asked=replace(asked, movie=changed, robot=robot), facts=facts, doubts=doubts)
 
 
 def on_one_clock(asked: Config) -> bool:
@@ -191,12 +184,7 @@ def _refutes(um_per_rev: float, fit: MotionFit) -> bool:
 
 
 def overlapping(asked: Config) -> Config:
-    """The configuration with the log at the movie, wherever its clock begins: a log that is elsewhere is refused.
-
-    Without a log it is as it is.
-    """
-    if not asked.movie.coils:
-        return asked
+    """The configuration with the log at the movie, wherever its clock begins: a log that is elsewhere is refused."""
     with MovieSource(replace(asked.movie, coils=""), asked.coils) as source:
         first_s = seconds(source.first_ns)
     movie = asked.movie

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from flowrec.verbs.command import Told, add_verb, verb
-from flowrec.verbs.options import Asked, Overwrite, Sets, WholeDescriptions
+from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions
 
 TomlOut = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="TOML", help="Write the settings as a section of a configuration.")
@@ -23,11 +23,7 @@ class _Calibrations(WholeDescriptions):
         return super().resolve_command(ctx, args)
 
 
-def _itself(_asked: Asked, told: Told) -> Told:
-    return told
-
-
-@verb(result=_itself)
+@verb()
 def coils(
     file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
     out: TomlOut = None,
@@ -40,7 +36,7 @@ def coils(
     return Told(lambda: by.figures(fit), lambda: by.show(fit, out))
 
 
-@verb(result=_itself)
+@verb()
 def motion(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap), recorded or imported.")],
     coils: Annotated[
@@ -57,7 +53,7 @@ def motion(
     return Told(lambda: by.figures(fit), lambda: by.show(fit, session, out))
 
 
-@verb(result=_itself)
+@verb()
 def image(
     picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
     config: Annotated[
@@ -83,7 +79,7 @@ def image(
     return Told(lambda: by.figures(done), lambda: by.show(done, out), int(done.chosen is None))
 
 
-@verb("flowrec calibrate chip movie.avi --um-per-px 5 --inlet left:0 --inlet-speed 200 -o chip.toml", result=_itself)
+@verb("flowrec calibrate chip movie.avi --um-per-px 5 --inlet left:0 --inlet-speed 200 -o chip.toml")
 def chip(
     picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
     out: Annotated[

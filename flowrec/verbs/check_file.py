@@ -12,7 +12,6 @@ from flowrec.core import (
     NUMERICS_VERSION,
     Coverage,
     FlowrecError,
-    Message,
     Outcome,
     __version__,
     camera_summary,
@@ -24,15 +23,22 @@ from flowrec.core import (
     skew_ppm,
 )
 from flowrec.physics import chip_from_files
-from flowrec.stages import ResolvedConfig, config_from_toml, needed_packages
+from flowrec.stages import ResolvedConfig, TrackQuality, calibration_of, config_from_toml, needed_packages
 from flowrec.store import (
     FRAME_PATH,
     Audit,
     audit,
     is_left_out,
 )
-from flowrec.verbs.check_tally import GAP_PERIODS, Tally, TrackTally
-from flowrec.verbs.verdict import CONSISTENT, DAMAGED, NO_DIGEST, UNFINISHED, CheckFinding, Verdict
+from flowrec.verbs.verdict import (
+    CONSISTENT,
+    DAMAGED,
+    GAP_PERIODS,
+    NO_DIGEST,
+    UNFINISHED,
+    Tally,
+    Verdict,
+)
 
 _LISTED = 4  # gaps, kinds of numbers and settings of a clock that are named one by one
 _RATE_TOLERANCE = 0.05
@@ -52,20 +58,26 @@ class FileCheck:
     """
 
     def __init__(self, path: Path, progress: Callable[[int], None] | None, before: int) -> None:
-        self.tally, self._track = Tally(), TrackTally()
-        self.found = Audit(path, 0)
+        self.tally, self.found = Tally(), Audit(path, 0)
         self.read_bytes = 0
         self._progress, self._before = progress, before  # of the files before
         self.verdict = Verdict(path, Coverage(0, 0, "bytes"))
+        self._config: ResolvedConfig | None = None
+        self._head_fault = ""
 
     def _begin(self, found: Audit) -> None:
-        self.found = found
-        self.tally.begin(found)
-        self._track.begin(found)
-
-    def _add(self, name: str, log_ns: int, message: Message) -> None:
-        self.tally.add(name, log_ns, message)
-        self._track.add(log_ns, message)
+        """Take the head, before the first message."""
+        self.found, header = found, found.header
+        quality: TrackQuality | None = None
+        try:
+            if header is not None:
+                config = self._config = config_from_toml(header.config_toml, "its configuration", header.provenance)
+                chip = chip_from_files(header.chip_png, header.chip_toml, "its chip")
+                shape = config.camera.height_px, config.camera.width_px
+                quality = TrackQuality(calibration_of(config, chip), shape, config.robot)
+        except FlowrecError as error:
+            self._head_fault = str(error)
+        self.tally.begin(found, quality)
 
     def _at(self, read_bytes: int) -> None:
         self.read_bytes = read_bytes
@@ -80,26 +92,24 @@ class FileCheck:
     def _path(self, name: str) -> str:
         return self.found.topics.by_field[name].path
 
-    def faults_of_messages(self) -> list[CheckFinding]:
-        """Faults of single messages among those that were read so far."""
-        so_far = Verdict(self.found.path, self.verdict.covered)
-        if undecodable := self.found.undecodable.total():
-            so_far.bad(
-                "content", f"{undecodable} messages can not be decoded, the first is {self.found.first_undecodable}"
-            )
+    def undecodable(self, verdict: Verdict) -> None:
+        """Tell of messages, among those that were read so far, that can not be decoded."""
+        if count := self.found.undecodable.total():
+            verdict.bad("content", f"{count} messages can not be decoded, the first is {self.found.first_undecodable}")
+
+    def not_finite(self, verdict: Verdict) -> None:
+        """Tell of NaN and infinity in the messages that were read so far."""
         for what, count in self.tally.not_finite.most_common(_LISTED):
-            so_far.odd("numbers", f"NaN or infinity in {what}, {count} times")
-        return so_far.findings
+            verdict.odd("numbers", f"NaN or infinity in {what}, {count} times")
 
     def read(self) -> None:
         """Read the file and judge it."""
-        self.found = audit(self.found.path, self._add, self._at, self._begin)
+        self.found = audit(self.found.path, self.tally.add, self._at, self._begin)
         self._at(self.found.size_bytes)
         self.tally.close()
-        self._track.close()
         self.verdict.topics = self.topics
         self.verdict.covered = Coverage(self.read_bytes, self.found.size_bytes, "bytes")
-        self._config = self._header()
+        self._header()
         self._end()
         self._content()
         self._digest()
@@ -109,7 +119,7 @@ class FileCheck:
         self._clocks()
         self._replay()
 
-    def _header(self) -> ResolvedConfig | None:
+    def _header(self) -> None:
         verdict, found = self.verdict, self.found
         written = f"by flowrec {found.flowrec_version}"
         if found.flowrec_version != __version__:
@@ -118,17 +128,10 @@ class FileCheck:
         if numerics not in (None, str(NUMERICS_VERSION)):
             written += f", made by other numerics (version {numerics}; this is {NUMERICS_VERSION})"
         verdict.fact("written", written)
-        header = found.header
-        if header is None:
+        if found.header is None:
             verdict.bad("head", f"its header is incomplete: {found.header_fault}")
-            return None
-        config = None
-        try:
-            config = config_from_toml(header.config_toml, "its configuration", header.provenance)
-            chip_from_files(header.chip_png, header.chip_toml, "its chip")
-        except FlowrecError as error:
-            verdict.bad("head", str(error))
-        return config
+        elif self._head_fault:
+            verdict.bad("head", self._head_fault)
 
     def _end(self) -> None:
         verdict, found = self.verdict, self.found
@@ -152,7 +155,9 @@ class FileCheck:
             verdict.odd("end", f"it was recovered from {source}; {note}")
         elif source is not None:
             verdict.fact("recovered", f"from {source}, without a loss")
-        for doubt in dict.fromkeys([*doubts_of(found.outcome), *self._track.doubts()]):
+        quality = self.tally.quality
+        doubts = [*doubts_of(found.outcome), *(quality.doubts() if quality is not None else [])]
+        for doubt in dict.fromkeys(doubts):
             verdict.odd("doubts", f"doubtful: {doubt}")
 
     def _content(self) -> None:
@@ -167,7 +172,7 @@ class FileCheck:
             verdict.bad("index", f"{text}; `flowrec recover {found.path}` makes a new index")
         for text in found.disagreements:
             verdict.odd("index", text)
-        verdict.findings += [fault for fault in self.faults_of_messages() if fault.about == "content"]
+        self.undecodable(verdict)
         for name, count in (+found.missing).items():
             verdict.odd("content", f"{count} messages of {self._path(name)} are missing in the middle")
         agrees = found.finished and not (found.contradictions or found.disagreements or found.lost)
@@ -261,7 +266,7 @@ class FileCheck:
                 verdict.odd("drops", f"the camera was absent {losses.reconnections} times, and came back")
 
     def _numbers(self) -> None:
-        self.verdict.findings += [fault for fault in self.faults_of_messages() if fault.about == "numbers"]
+        self.not_finite(self.verdict)
         if not self.tally.not_finite:
             self.verdict.fact("numbers", "finite wherever they must be")
 

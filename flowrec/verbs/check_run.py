@@ -62,7 +62,8 @@ def _verdict_so_far(path: Path, covered: Coverage, checks: Sequence[FileCheck]) 
     """Verdict on the bytes that were read before a signal."""
     verdict = Verdict(path, covered)
     for check in checks:
-        verdict.findings += check.faults_of_messages()
+        check.undecodable(verdict)
+        check.not_finite(verdict)
         for topic, count in check.topics.items():
             verdict.topics[topic] = verdict.topics.get(topic, 0) + count
     return verdict

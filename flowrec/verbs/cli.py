@@ -1,6 +1,6 @@
 """The command line: all verbs, the entry point, and its errors in one line.
 
-A verb is a function in the file of its name; command.py makes its command.
+A verb is a function of its name, beside those of its kind; command.py makes its command.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs, 130 stopped by Ctrl-C or a key, 143 by SIGTERM, 129 by a closed terminal.
@@ -18,47 +18,45 @@ from typing import Annotated, Any
 import typer
 
 import flowrec
-from flowrec.core import FlowrecError, StoppedError, printable
+from flowrec.core import FlowrecError, StoppedError, UsageError, printable
 from flowrec.store import TIMEOUT_KEY, TRAFFIC
-from flowrec.verbs import outside_verbs
 from flowrec.verbs.calibrate import calibrate
-from flowrec.verbs.check import check
-from flowrec.verbs.command import add_verb
+from flowrec.verbs.check import check, recover
+from flowrec.verbs.command import add_verb, outside_verb
 from flowrec.verbs.compare import compare
 from flowrec.verbs.doctor import doctor
-from flowrec.verbs.export import export
-from flowrec.verbs.import_movie import import_movie
-from flowrec.verbs.info import info
+from flowrec.verbs.export import export, report, view
+from flowrec.verbs.info import info, note
 from flowrec.verbs.ls import ls
-from flowrec.verbs.methods import methods
-from flowrec.verbs.new import new
-from flowrec.verbs.note import note
+from flowrec.verbs.methods import methods, new
 from flowrec.verbs.options import (
-    HELP_WIDTH,
+    HELP_SETTINGS,
     OUR_VERBS,
     Stoppable,
     WholeDescriptions,
     from_above,
 )
-from flowrec.verbs.record import record
-from flowrec.verbs.recover import recover
+from flowrec.verbs.record import import_movie, record
 from flowrec.verbs.replay import DEFAULT_REFINE, replay
-from flowrec.verbs.report import report
-from flowrec.verbs.view import view
 
 
 class _Verbs(Stoppable, WholeDescriptions):
     """Our verbs and those of others."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        return super().get_command(ctx, cmd_name) or outside_verbs.verb(cmd_name)
+        return super().get_command(ctx, cmd_name) or outside_verb(cmd_name)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        ours = super().list_commands(ctx)
-        return [*ours, *(name for name in outside_verbs.verb_names() if name not in ours)]
+        from flowrec.core import VERBS, entry_points_of
+
+        return list(dict.fromkeys((*super().list_commands(ctx), *entry_points_of(VERBS))))
 
     def command_for_help(self, ctx: Any, name: str) -> Any:
-        return super().get_command(ctx, name) or outside_verbs.verb_for_help(name)
+        """For one that can not be used, a command whose help states the fault."""
+        try:
+            return self.get_command(ctx, name)
+        except UsageError as error:
+            return typer.core.TyperCommand(name, help=f"Can not be used: {error}")
 
 
 app = typer.Typer(
@@ -66,9 +64,7 @@ app = typer.Typer(
     name="flowrec",
     help="Record, replay and view missions of magnetic micro-robots in flow.",
     no_args_is_help=True,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # frames around the help would take as long to draw as all the rest
+    **HELP_SETTINGS,
 )
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(from_above("bench"), name="bench")

@@ -10,6 +10,8 @@ A result has `as_json()`, and `lines()` or `show()`, which prints, and may have 
 something else than the function returns, `result` makes a `Told` of it.
 """
 
+from __future__ import annotations
+
 import inspect
 import json
 import os
@@ -24,10 +26,10 @@ from typer.core import TyperCommand
 from typer.models import ParameterInfo
 
 from flowrec.core import Ended, FlowrecError, UsageError, printable, table_at
-from flowrec.verbs.options import AsJson, Asked, Supplied
+from flowrec.verbs.options import HELP_SETTINGS, AsJson, Asked, Supplied
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-_SECTION = re.compile(r"^(\w+)\n-{3,}$|^>>> ", re.MULTILINE)  # of a docstring: what is Python's begins there
+_SECTION = re.compile(r"^\w+\n-{3,}$|^>>> ", re.MULTILINE)  # of a docstring: what is Python's begins there
 _TOLD_WITHIN_S = 0.3  # of a run that was stopped: a frozen terminal must not delay the exit
 
 
@@ -65,11 +67,17 @@ class Told(NamedTuple):
     ends_at_once: bool = False
 
     @classmethod
-    def of(cls, found: Any) -> Self:
-        """A result that has what it tells as methods."""
+    def of(cls, found: Any, **asked: Any) -> Self:
+        """A result that has what it tells as methods, or is one itself; `asked` comes first in the JSON, as text."""
+        if isinstance(found, cls):
+            return found
         as_json, show = getattr(found, "as_json", None), getattr(found, "show", None)
-        show = show or (lambda: print_lines(found.lines()))
-        return cls(as_json, show, lambda: getattr(found, "exit_status", 0))
+        named = {name: str(value) for name, value in asked.items()}
+        return cls(
+            (lambda: named | as_json()) if named and as_json is not None else as_json,
+            show or (lambda: print_lines(found.lines())),
+            lambda: getattr(found, "exit_status", 0),
+        )
 
 
 class Verb(NamedTuple):
@@ -118,7 +126,8 @@ def add_verb(app: typer.Typer, function: Callable[..., Any], name: str | None = 
     """Add the command of a verb to an app, by default under the function's name."""
     examples = function.verb.examples  # type: ignore[attr-defined]
     epilog = "\n\n".join(["Examples:", *examples]) if examples else None
-    app.command(name or function.__name__, cls=_VerbCommand, help=_help(function), epilog=epilog)(_command(function))
+    told, *_ = _SECTION.split(inspect.getdoc(function) or "", maxsplit=1)
+    app.command(name or function.__name__, cls=_VerbCommand, help=told.rstrip(), epilog=epilog)(_command(function))
 
 
 class _VerbCommand(TyperCommand):
@@ -167,12 +176,31 @@ def _command(function: Callable[..., Any]) -> Callable[..., None]:
     if declared.with_json:
         as_json = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
         parameters.append(as_json)
-    supplied = _makers_of(function)
+    supplied = {
+        each.name: mark.make
+        for each in declared.parameters
+        for mark in get_args(each.annotation)[1:]
+        if isinstance(mark, Supplied)
+    }
+
+    def call(asked: Asked, as_json: bool) -> Any:
+        """The result of the function, or the partial one if it was ended."""
+        try:
+            return function(**asked, **{name: make() for name, make in supplied.items()})
+        except Ended as ended:
+            if ended.result is None:
+                raise
+            return ended.result
+        except FlowrecError as error:
+            if declared.refused is None or not as_json:
+                raise
+            refusal = declared.refused(asked, error)
+            typer.echo(json.dumps(refusal))
+            raise typer.Exit(refusal.get("exit_status", error.exit_status)) from error
 
     def command(as_json: bool = False, **asked: Any) -> None:
         try:
-            found = _call(function, asked, supplied, as_json)
-            _tell(declared.result(asked, found), as_json)
+            _tell(declared.result(asked, call(asked, as_json)), as_json)
         except MisuseError as error:
             raise typer.BadParameter(str(error), param_hint=error.option or None) from error
 
@@ -180,37 +208,6 @@ def _command(function: Callable[..., Any]) -> Callable[..., None]:
     command.__annotations__ = {each.name: each.annotation for each in parameters}
     command.tables = tables  # type: ignore[attr-defined]
     return command
-
-
-def _call(
-    function: Callable[..., Any],
-    asked: Asked,
-    supplied: dict[str, Callable[[], Any]],
-    as_json: bool,
-) -> Any:
-    """Call a function; return its result, or the partial one if it was ended."""
-    refused = function.verb.refused  # type: ignore[attr-defined]
-    try:
-        return function(**asked, **{name: make() for name, make in supplied.items()})
-    except Ended as ended:
-        if ended.result is None:
-            raise
-        return ended.result
-    except FlowrecError as error:
-        if refused is None or not as_json:
-            raise
-        refusal = refused(asked, error)
-        typer.echo(json.dumps(refusal))
-        raise typer.Exit(refusal.get("exit_status", error.exit_status)) from error
-
-
-def _makers_of(function: Callable[..., Any]) -> dict[str, Callable[[], Any]]:
-    return {
-        each.name: mark.make
-        for each in function.verb.parameters  # type: ignore[attr-defined]
-        for mark in get_args(each.annotation)[1:]
-        if isinstance(mark, Supplied)
-    }
 
 
 def print_lines(lines: Iterable[str]) -> None:
@@ -236,15 +233,14 @@ def _tell(told: Told, as_json: bool) -> None:
         from flowrec.core import said_within
 
         said_within(_TOLD_WITHIN_S, tell)
-        os._exit(_status(told))
-    tell()
-    told.after()
-    if status := _status(told):
+    else:
+        tell()
+        told.after()
+    status = told.exit_status() if callable(told.exit_status) else told.exit_status
+    if told.ends_at_once:
+        os._exit(status)
+    if status:
         raise typer.Exit(status)
-
-
-def _status(told: Told) -> int:
-    return told.exit_status() if callable(told.exit_status) else told.exit_status
 
 
 def _completion(table: str) -> Callable[[str], list[str]]:
@@ -254,17 +250,6 @@ def _completion(table: str) -> Callable[[str], list[str]]:
         return [name for name in table_at(table).names() if name.startswith(incomplete)]
 
     return complete
-
-
-def _parts_of_docstring(function: Callable[..., Any]) -> tuple[str, str]:
-    """Split a docstring into the text of the help and the rest, which begins with an example or a section."""
-    text = inspect.getdoc(function) or ""
-    found = _SECTION.search(text)
-    return (text, "") if found is None else (text[: found.start()].rstrip(), text[found.start() :])
-
-
-def _help(function: Callable[..., Any]) -> str:
-    return _parts_of_docstring(function)[0]
 
 
 def _documentation(function: Callable[..., Any]) -> str:
@@ -280,3 +265,25 @@ def _documentation(function: Callable[..., Any]) -> str:
     found = re.search(r"^\w+\n-{3,}$", text, re.MULTILINE)
     at = found.start() if found is not None else len(text)
     return f"{text[:at].rstrip()}\n\n{head}{lines}\n\n{text[at:]}".rstrip()
+
+
+def outside_verb(name: str) -> Any:
+    """The verb of a name that a package of others brings, as a command for typer; None if none does.
+
+    Raises
+    ------
+    UsageError : its package can not be imported, or declares no function.
+    """
+    from flowrec.core import VERBS, the_one
+
+    source = the_one(VERBS, name)
+    if source is None:
+        return None
+    found = source.load()
+    if isinstance(found, type) or not callable(found):
+        raise source.refusal("which declares it as a verb, but it is no function")
+    app = typer.Typer(add_completion=False, **HELP_SETTINGS)
+    app.command(name)(found)
+    command = typer.main.get_command(app)
+    command.name = name
+    return command

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
 
 def _output_of(asked: Asked, found: "SessionComparison") -> Told:
-    names = {f"{which}_session": str(asked[which]) for which in ("first", "second")}
-    return Told.of(found)._replace(as_json=lambda: names | found.as_json())
+    return Told.of(found, first_session=asked["first"], second_session=asked["second"])
 
 
 @verb(

@@ -104,7 +104,7 @@ class Difference:
     index: tuple[int, ...] | None
     values: tuple[object, object]
     excess: float
-    words: tuple[str, str] = ("recorded", "replayed")
+    words: tuple[str, str]
 
     @property
     def beyond(self) -> bool:
@@ -118,7 +118,8 @@ class Difference:
 
     def as_json(self) -> dict[str, Any]:
         """The difference for JSON; values that JSON can not hold are text."""
-        values = [value if _is_json(value) else _text(value) for value in self.values]
+        infinite = [isinstance(value, float) and not math.isfinite(value) for value in self.values]
+        values = [_text(value) if wrong else value for value, wrong in zip(self.values, infinite, strict=True)]
         return {
             "topic": self.topic,
             "stamp_s": seconds(self.stamp_ns),
@@ -185,10 +186,12 @@ class Comparison:
     first: Difference | None = None
     _before: tuple[Tick, Tick] = (Tick(), Tick())
     _names: dict[str, list[str]] = field(default_factory=dict)
+    _known: TopicTable = FIXED
     _compared: list[Topic] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        topics = self.sides[0].topics.with_types_of(self.sides[1].topics).topics
+        self._known = self.sides[0].topics.with_types_of(self.sides[1].topics)
+        topics = self._known.topics
         self._compared = [topic for topic in topics if topic.role in self.roles and topic.path not in self.left_out]
         for topic in topics:
             lacking = self.sides[0].lacks(topic) | self.sides[1].lacks(topic)
@@ -257,10 +260,12 @@ class Comparison:
         if not names:
             return None
         count = self.topics.setdefault(topic.path, TopicCount())
-        difference = first_difference(topic, was, now, stamp_ns, names, self.words)
-        if difference is None:
+        largest = _largest_deviation(topic, was, now, names)
+        if largest is None:
             count.identical += 1
             return None
+        name, (excess, index, first, second) = largest
+        difference = Difference(topic.path, stamp_ns, name, index, (first, second), excess, self.words)
         if difference.beyond:
             count.different += 1
             self.first = self.first or difference
@@ -285,17 +290,14 @@ class Comparison:
         width = max(width, max(map(len, (*self.topics, *self.not_recorded)), default=0))
         for topic, count in self.topics.items():
             total = count.identical + count.within_tolerance + count.different
+            computed = self._known.by_path[topic].source in (Source.STAGE, Source.WORKER)
+            word = self.different_word if computed else "DIFFERENT"
             lines.append(
                 f"{topic:{width}s}  {count.identical} of {total} identical"
                 + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
-                + (f", {count.different} {self._word_of(topic)}" if count.different else "")
+                + (f", {count.different} {word}" if count.different else "")
             )
         return lines + [printable(f"{what:{width}s}  {why}") for what, why in self.not_recorded.items()]
-
-    def _word_of(self, path: str) -> str:
-        topics = self.sides[0].topics.with_types_of(self.sides[1].topics)
-        computed = topics.by_path[path].source in (Source.STAGE, Source.WORKER)
-        return self.different_word if computed else "DIFFERENT"
 
     def as_json(self) -> dict[str, Any]:
         """The result for JSON."""
@@ -311,52 +313,40 @@ class Comparison:
         }
 
 
-def first_difference(
-    topic: Topic,
-    was: Message | None,
-    now: Message | None,
-    stamp_ns: int,
-    names: Iterable[str] | None = None,
-    words: tuple[str, str] = ("recorded", "replayed"),
-) -> Difference | None:
-    """The largest difference between two messages of a topic relative to its tolerance; None if they are identical.
-
-    Parameters
-    ----------
-    names : of the fields to compare; None: all.
-    """
+def _largest_deviation(
+    topic: Topic, was: Message | None, now: Message | None, names: Iterable[str]
+) -> tuple[str, _Deviation] | None:
+    """The field in which two messages of a topic differ most, relative to its tolerance; None if they are identical."""
     if was is None or now is None:
-        values = tuple("absent" if message is None else "present" for message in (was, now))
-        return Difference(topic.path, stamp_ns, "message", None, (values[0], values[1]), math.inf, words)
-    worst: Difference | None = None
-    for name in names if names is not None else _fields_of([topic])[topic.field]:
+        first, second = ("absent" if message is None else "present" for message in (was, now))
+        return "message", (math.inf, None, first, second)
+    worst: tuple[str, _Deviation] | None = None
+    for name in names:
         before, after = getattr(was, name), getattr(now, name)
         if type(before) is type(after) and not isinstance(before, np.ndarray) and before == after:
             continue  # most fields of a replay, without the search for the tolerance
         deviation = _deviation(before, after, topic.rtol, topic.atol_of(name))
-        if deviation is not None and (worst is None or deviation[0] > worst.excess):
-            excess, index, first, second = deviation
-            worst = Difference(topic.path, stamp_ns, name, index, (first, second), excess, words)
+        if deviation is not None and (worst is None or deviation[0] > worst[1][0]):
+            worst = name, deviation
     return worst
 
 
 def _deviation(was: object, now: object, rtol: float, atol: float) -> _Deviation | None:
     """Deviation of two values relative to the tolerance, by |was - now| <= atol + rtol |was|; None if bit-identical."""
     if isinstance(was, np.ndarray) and isinstance(now, np.ndarray):
-        if was.shape != now.shape or was.dtype.kind != now.dtype.kind:
-            return math.inf, None, _form(was), _form(now)
-        if was.dtype == now.dtype and was.tobytes() == now.tobytes():
-            return None
-        excess = _excess(was, now, rtol, atol)
-        index = tuple(int(i) for i in np.unravel_index(int(np.argmax(excess)), excess.shape))
-        return float(excess[index]), index, was[index].item(), now[index].item()
-    if isinstance(was, float) and isinstance(now, float | int) and not isinstance(now, bool):
+        if was.shape == now.shape and was.dtype.kind == now.dtype.kind:
+            if was.dtype == now.dtype and was.tobytes() == now.tobytes():
+                return None
+            excess = _excess(was, now, rtol, atol)
+            index = tuple(int(i) for i in np.unravel_index(int(np.argmax(excess)), excess.shape))
+            return float(excess[index]), index, was[index].item(), now[index].item()
+    elif isinstance(was, float) and isinstance(now, float | int) and not isinstance(now, bool):
         if was == now or (was != was and now != now):
             return None
         return float(_excess(np.array(was), np.array(now), rtol, atol)), None, was, now
-    if isinstance(was, np.ndarray) or isinstance(now, np.ndarray):
-        return math.inf, None, _form(was), _form(now)
-    return None if was == now else (math.inf, None, was, now)
+    elif not isinstance(was, np.ndarray) and not isinstance(now, np.ndarray) and was == now:
+        return None
+    return math.inf, None, _form(was), _form(now)
 
 
 def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> NDArray[np.float64]:
@@ -375,7 +365,3 @@ def _form(value: object) -> object:
 
 def _text(value: object) -> str:
     return "absent" if value is None else str(value) if value in ("absent", "present") else repr(value)
-
-
-def _is_json(value: object) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)

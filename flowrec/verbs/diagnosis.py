@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,10 +39,11 @@ from flowrec.stages import (
     resolve,
 )
 from flowrec.store import frames_of, image_bytes_s
+from flowrec.verbs.admission import rehearse
 from flowrec.verbs.preparation import refuse_adrift
-from flowrec.verbs.rehearsal import rehearse
 from flowrec.view import executable, has_display
 
+T = TypeVar("T")
 OK, WARNING, FAILURE = "ok", "warning", "failure"
 _SIGNS = {OK: " ", WARNING: "!", FAILURE: "x"}
 _OF_DEVICES = ("camera", "coils", "lab")  # sections
@@ -87,6 +88,9 @@ class Finding:
         return f"{_SIGNS[self.level]} {self.what:12s} {self.text}"
 
 
+Findings = Generator[Finding, None, None]
+
+
 def diagnose(
     asked: Config, config_file: Path | None = None, folder: Path | None = None, wrong: str = ""
 ) -> Iterator[Finding]:
@@ -98,51 +102,53 @@ def diagnose(
     folder : where sessions are written; None: the present one.
     wrong : why the configuration was refused, and `asked` is only what is right of it; "" if it was not.
     """
-    settled: list[tuple[ResolvedConfig, Chip | None]] = []
+    settled: tuple[ResolvedConfig, Chip | None] | None = None
     if wrong:
         yield Finding("settings", FAILURE, wrong)
     else:
-        yield from _look("settings", lambda: _settings(asked, settled))
-    if not settled and asked.rig == LAB:
-        yield from _look("devices", lambda: _without_settings(asked, settled))
-    if settled:
-        config, chip = settled[0]
+        settled = yield from _look("settings", _settings, asked)
+    if settled is None and asked.rig == LAB:
+        settled = yield from _look("devices", _without_settings, asked)
+    if settled is not None:
+        config, chip = settled
         if chip is not None:
-            known = chip
-            yield from _look("mission", lambda: _mission(config, known))
+            yield from _look("mission", _mission, config, chip)
             if config.recording.admission_s:
-                yield from _look("kernels", lambda: _kernels(config))
+                yield from _look("kernels", _kernels, config)
         if asked.rig == LAB:
-            yield from _look("camera", lambda: _camera(config, chip))
-            yield from _look("coils", lambda: _coils(config))
+            yield from _look("camera", _camera, config, chip)
+            yield from _look("coils", _coils, config)
         else:
             text = f"rig = {asked.rig!r}: neither camera nor coils are looked at; give the configuration of the lab"
             yield Finding("devices", WARNING, f"{text}, with rig = 'lab'")
-        yield from _look("disk", lambda: _disk(config, folder or Path()))
+        yield from _look("disk", _disk, config, folder or Path())
     yield from _calibrations(asked, config_file)
     yield _viewer()
 
 
-def _look(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+def _look(
+    what: str, check: Callable[..., Generator[Finding, None, T]], *given: Any
+) -> Generator[Finding, None, T | None]:
     """The findings of a check; an error, which says in its line what to do, is a failure."""
     try:
-        yield from check()
+        return (yield from check(*given))
     except FlowrecError as error:
         yield Finding(what, FAILURE, str(error))
     except OSError as error:
         yield Finding(what, FAILURE, f"{error.strerror or error}; see to it, then try again")
+    return None
 
 
-def _without_settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip | None]]) -> Iterator[Finding]:
-    settled.append((stand_in(asked), None))
+def _without_settings(asked: Config) -> Generator[Finding, None, tuple[ResolvedConfig, None]]:
+    config = stand_in(asked)
     text = "what is wrong or missing in the settings is made up to look at them; mission and walls are left out"
     yield Finding("devices", WARNING, text)
+    return config, None
 
 
-def _settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip | None]]) -> Iterator[Finding]:
+def _settings(asked: Config) -> Generator[Finding, None, tuple[ResolvedConfig, Chip]]:
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
-    settled.append((config, chip))
     camera = config.camera
     yield Finding(
         "settings",
@@ -150,9 +156,10 @@ def _settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip | None]]) 
         f"chip {chip.name}; {camera.width_px} x {camera.height_px} pixels of {camera.bits} bit at {camera.rate_hz:g} "
         f"Hz, {camera.um_per_px:.4g} um per pixel; robot of radius {config.robot.radius_um:g} um",
     )
+    return config, chip
 
 
-def _mission(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
+def _mission(config: ResolvedConfig, chip: Chip) -> Findings:
     mission = config.mission
     if mission.observes:
         yield Finding("mission", OK, "observes: the coils are not used")
@@ -170,7 +177,7 @@ def _mission(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
     )
 
 
-def _kernels(config: ResolvedConfig) -> Iterator[Finding]:
+def _kernels(config: ResolvedConfig) -> Findings:
     """Compile what a live run would compile before it begins."""
     known = kernels_cached()
     begin_s = time.perf_counter()
@@ -184,7 +191,7 @@ def _kernels(config: ResolvedConfig) -> Iterator[Finding]:
     yield Finding("kernels", OK, f"{text}; a short simulated mission with this configuration's methods went through")
 
 
-def _camera(config: ResolvedConfig, chip: Chip | None) -> Iterator[Finding]:
+def _camera(config: ResolvedConfig, chip: Chip | None) -> Findings:
     from flowrec.rigs import probe_camera
 
     camera = config.camera
@@ -256,7 +263,7 @@ def _losses(losses: CameraLosses | None) -> Iterator[Finding]:
         yield Finding("losses", level, f"{count} of {losses.ids} images {_CAUSES[cause]}")
 
 
-def _coils(config: ResolvedConfig) -> Iterator[Finding]:
+def _coils(config: ResolvedConfig) -> Findings:
     if config.mission.observes:
         yield Finding("coils", OK, "not used by a mission that observes")
         return
@@ -300,7 +307,7 @@ def _silence(config: ResolvedConfig) -> Finding:
     return Finding("guardian", FAILURE, "it does not notice that a loop falls silent; do not record with these coils")
 
 
-def _disk(config: ResolvedConfig, folder: Path) -> Iterator[Finding]:
+def _disk(config: ResolvedConfig, folder: Path) -> Findings:
     speed = _write_speed(folder)
     need = image_bytes_s(config) / _PACKED[frames_of(config)]
     left = max(shutil.disk_usage(folder).free - 1e9 * config.recording.disk_floor_gb, 0.0)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +35,6 @@ from flowrec.stages import (
     look,
     walls_in_view,
 )
-from flowrec.verbs.misfit import Evidence
 from flowrec.verbs.preparation import Prepared, prepare
 
 _SHAKES_PX = 0.1  # root mean square from which on it is told; half a pixel is what a track is off at most
@@ -47,14 +46,6 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """The first image that shows the robot, or the first one where none does."""
-
-    frame: Frame
-    sight: Sight
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class MovieTracks:
     """Track of the robot in the images of a movie, before anything is recorded.
 
@@ -63,23 +54,28 @@ class MovieTracks:
     stamps_ns : (n,) session stamps of the images in which it is seen, by movie.clock_rate and clock_offset_s.
     positions_um : (n, 2) on the chip.
     log : what the coils did on the same clock, without the robot's delay.
-    evidence : what the images show besides, for a log that does not explain the track.
+    shake_px : root mean square of the images' motion against the walls; None: it can not be measured.
+    stabilised : that motion is taken out of the positions.
+    um_per_px : of the camera.
+    doubts : about the track.
     """
 
     stamps_ns: NDArray[np.int64]
     positions_um: Floats
     log: FieldLog
-    evidence: Evidence
+    shake_px: float | None
+    stabilised: bool
+    um_per_px: float
+    doubts: Sequence[str]
 
-    def shifted_by(self, by_um: Floats) -> MovieTracks:
-        """Copy with all positions shifted by (2,), in um."""
-        positions_um = self.positions_um + by_um
-        evidence = replace(self.evidence, positions_um=positions_um)
-        return replace(self, positions_um=positions_um, evidence=evidence)
+    @property
+    def time_s(self) -> Floats:
+        """The stamps in s."""
+        return self.stamps_ns / NS_PER_S
 
 
 class Looked(NamedTuple):
-    """Result of the first pass.
+    """What is known of a movie before it is imported.
 
     Attributes
     ----------
@@ -87,12 +83,14 @@ class Looked(NamedTuple):
     facts : for the head of the session.
     prepared : the settings of the pass, its chip, and what its images say about the axes.
     tracks : None where there is no log that they could be compared with.
+    doubts : reasons to doubt the import.
     """
 
     asked: Config
     facts: Mapping[str, str]
     prepared: Prepared
     tracks: MovieTracks | None
+    doubts: Sequence[str] = ()
 
 
 def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Looked:
@@ -120,29 +118,29 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
     p, movie = prepared.pipeline, looked_at.movie
     if place_px is None and not marked:
         seen = _first_seen(p, movie, prepared)
-        asked = _with_chosen_body(asked, p, seen, robot, folder) if seen is not None else asked
+        asked = _with_chosen_body(asked, p, *seen, robot, folder) if seen is not None else asked
     click = asked.tracker
     p = replace(p, tracker=replace(p.tracker, click_px=click.click_px, click_frame=click.click_frame))
-    passed = _Pass(p, movie, prepared)
-    tracks = passed.tracks()
+    shifts_px, tracks = _look_through(p, movie, prepared)
     facts: Mapping[str, str] = {}
     if p.stabiliser.on:
         first_px = asked.stabilise.first_px
-        asked, facts = _with_mean_shift(asked, passed.shifts_px)
+        asked, facts = _with_mean_shift(asked, shifts_px)
         if tracks is not None:  # as they are with the shift of the first image that was found
-            tracks = tracks.shifted_by(p.calibration.to_um(first_px) - p.calibration.to_um(asked.stabilise.first_px))
+            by_um = p.calibration.to_um(first_px) - p.calibration.to_um(asked.stabilise.first_px)
+            tracks = replace(tracks, positions_um=tracks.positions_um + by_um)
     return Looked(asked, facts, prepared, tracks)
 
 
-def _first_seen(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> _Seen | None:
+def _first_seen(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> tuple[Frame, Sight] | None:
     """The first image that shows the robot, or the first one where none does."""
     first, sight = None, Sight()
     with MovieSource(movie, prepared.config.coils) as source:
         for frame in _within(source, prepared):
             sight = look(p, sight, frame)
-            first = first or _Seen(frame, sight)
+            first = first or (frame, sight)
             if sight.track is not None and sight.track.seen:
-                return _Seen(frame, sight)
+                return frame, sight
     return first
 
 
@@ -154,54 +152,39 @@ def _within(source: MovieSource, prepared: Prepared) -> Iterator[Frame]:
     )
 
 
-class _Pass:
-    """Looks through all images.
-
-    Attributes
-    ----------
-    shifts_px : (n, 2) of all images; (0, 2): they can not be measured.
-    """
-
-    def __init__(self, p: Pipeline, movie: MovieSettings, prepared: Prepared) -> None:
-        self._p = p
-        self._tracks: list[Track] = []
-        self._quality = TrackQuality(p.calibration, p.image_shape, p.robot)
-        sight, shifts = Sight(), list[Floats]()
-        # The shift is measured, too, where it is not taken out of the track.
-        self._stabilised, measures = bool(p.stabiliser.on), replace(p.stabiliser, on=True)
-        shift, background = None, None
-        with MovieSource(movie, prepared.config.coils) as source:
-            self._log = source.log
-            for frame in _within(source, prepared):
-                if self._log is not None:
-                    sight = look(p, sight, frame)
-                    assert sight.track is not None, "the tracker says of every image whether it shows the robot"
-                    self._tracks.append(sight.track)
-                    self._quality.take(sight.track, sight.appearance, sight.shift)
-                if self._log is not None and self._stabilised:
-                    shift, background = sight.shift, sight.background
-                else:
-                    shift, background = measures.register(
-                        shift, background, sight.track, frame, p.chip, p.calibration, p.robot
-                    )
-                blind = background is None or not len(background.pixels)
-                if blind and self._log is None:
-                    break
-                shifts += [shift.shift_px] if shift is not None and not blind else []
-        self.shifts_px = np.array(shifts).reshape(-1, 2)
-
-    def tracks(self) -> MovieTracks | None:
-        """Positions of the robot in the images; None without a log."""
-        if self._log is None:
-            return None
-        seen = [track for track in self._tracks if track.seen]
-        stamps_ns = np.array([each.stamp_ns for each in seen], np.int64)
-        positions_um = np.array([each.position_um for each in seen]).reshape(-1, 2)
-        shake_px = float(np.sqrt(self.shifts_px.var(axis=0).sum())) if len(self.shifts_px) else None
-        um_per_px = self._p.calibration.um_per_px
-        time_s, doubts = stamps_ns / NS_PER_S, self._quality.doubts()
-        evidence = Evidence(time_s, positions_um, shake_px, self._stabilised, um_per_px, doubts)
-        return MovieTracks(stamps_ns, positions_um, self._log, evidence)
+def _look_through(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> tuple[Floats, MovieTracks | None]:
+    """Shifts (n, 2) of all images in px, (0, 2) if they can not be measured; the robot's track, None without a log."""
+    quality = TrackQuality(p.calibration, p.image_shape, p.robot)
+    sight, seen, shifts = Sight(), list[Track](), list[Floats]()
+    # The shift is measured, too, where it is not taken out of the track.
+    stabilised, measures = bool(p.stabiliser.on), replace(p.stabiliser, on=True)
+    shift, background = None, None
+    with MovieSource(movie, prepared.config.coils) as source:
+        log = source.log
+        for frame in _within(source, prepared):
+            if log is not None:
+                sight = look(p, sight, frame)
+                assert sight.track is not None, "the tracker says of every image whether it shows the robot"
+                quality.take(sight.track, sight.appearance, sight.shift)
+                seen += [sight.track] if sight.track.seen else []
+            if log is not None and stabilised:
+                shift, background = sight.shift, sight.background
+            else:
+                shift, background = measures.register(
+                    shift, background, sight.track, frame, p.chip, p.calibration, p.robot
+                )
+            blind = background is None or not len(background.pixels)
+            if blind and log is None:
+                break
+            shifts += [shift.shift_px] if shift is not None and not blind else []
+    shifts_px = np.array(shifts).reshape(-1, 2)
+    if log is None:
+        return shifts_px, None
+    stamps_ns = np.array([each.stamp_ns for each in seen], np.int64)
+    positions_um = np.array([each.position_um for each in seen]).reshape(-1, 2)
+    shake_px = float(np.sqrt(shifts_px.var(axis=0).sum())) if len(shifts_px) else None
+    um_per_px, doubts = p.calibration.um_per_px, quality.doubts()
+    return shifts_px, MovieTracks(stamps_ns, positions_um, log, shake_px, stabilised, um_per_px, doubts)
 
 
 def _with_mean_shift(asked: Config, shifts_px: Floats) -> tuple[Config, Mapping[str, str]]:
@@ -245,11 +228,11 @@ def _place_of(robot: str, asked: Config, p: Pipeline) -> tuple[float, float] | N
     return round(x, 2), round(y, 2)
 
 
-def _with_chosen_body(asked: Config, p: Pipeline, seen: _Seen, robot: str, folder: Path) -> Config:
+def _with_chosen_body(asked: Config, p: Pipeline, image: Frame, sight: Sight, robot: str, folder: Path) -> Config:
     """The configuration with the body that `robot` numbers; as it is, if only one qualifies."""
-    places, what = _candidates(p, seen)
-    image, name = seen.frame, asked.movie.path
-    if not len(places) or (len(places) == 1 and not robot and seen.sight.appearance is not None):
+    places, what = _candidates(p, image, sight)
+    name = asked.movie.path
+    if not len(places) or (len(places) == 1 and not robot and sight.appearance is not None):
         return asked
     if robot:
         number = int(robot)
@@ -266,13 +249,13 @@ def _with_chosen_body(asked: Config, p: Pipeline, seen: _Seen, robot: str, folde
     )
 
 
-def _candidates(p: Pipeline, seen: _Seen) -> tuple[Floats, str]:
+def _candidates(p: Pipeline, frame: Frame, sight: Sight) -> tuple[Floats, str]:
     """Places (n, 2) in px from the top down, and how they are told of."""
-    walls, calibration, sight = walls_in_view(p.chip, p.calibration, p.image_shape), p.calibration, seen.sight
+    walls, calibration = walls_in_view(p.chip, p.calibration, p.image_shape), p.calibration
     if any(off_px := shift_px(sight.shift)):
         walls, calibration = walls.for_shift(off_px), calibration.for_shift(off_px)
     radius_px = p.robot.radius_um / calibration.um_per_px
-    view = View(seen.frame.image, walls, radius_px, -p.tracker.wall_error_radii * radius_px)
+    view = View(frame.image, walls, radius_px, -p.tracker.wall_error_radii * radius_px)
     if sight.appearance is None or sight.track is None or not sight.track.seen:
         found = bodies_that_stand_out(view)
         what = "no image shows a dark disc or one bright spot; {} bodies stand out in image {}"

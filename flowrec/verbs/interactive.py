@@ -121,8 +121,8 @@ class StatusLine:
     def __init__(
         self,
         file_bytes: Callable[[], int],
-        disk: Callable[[], str] = lambda: "",
-        note: Callable[[], str | None] = lambda: None,
+        disk: Callable[[], str],
+        note: Callable[[], str | None],
     ) -> None:
         self._file_bytes = file_bytes
         self._disk = disk

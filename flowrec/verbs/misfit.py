@@ -8,56 +8,45 @@ Each is told by what the movie shows, not by the bad fit, and the first that hol
 - the body goes as the assumed flow carries it: another particle, which is not driven;
 - else it moves as a driven robot does, but at other times or in other directions: the log of another run.
 
-An image or a log with other axes (mirrored, turned, another scale) is looked for before all of these.
+An image or a log with other axes (mirrored, turned, another scale) is looked for before all of these: the image is
+compared with the walls of the chip (measure/picture_registration.py), and where that does not decide, the motion over
+all of the movie with the log.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowField
-from flowrec.measure import sampled_s
-from flowrec.physics import sample
-from flowrec.stages import FieldLog
+from flowrec.core import AxesVerdict, ChipError, FlowField, nanoseconds
+from flowrec.measure import ImageVerdict, sampled_s
+from flowrec.physics import Calibration, Chip, Orientation, nearest, sample
+from flowrec.stages import (
+    MotionVerdict,
+    MovieSettings,
+    ResolvedConfig,
+    contradiction,
+    orientation_by_motion,
+    own_gain,
+    registration_of,
+)
+from flowrec.verbs.first_pass import MovieTracks
+from flowrec.verbs.preparation import UNCHECKED
 
 _WINDOW_S = 0.3  # of the mean velocities: longer than noise of a track, shorter than most commands hold
 _LEAST_WINDOWS = 4
-_SHAKES_PX = 0.5  # root mean square from which on shake hides the commands; 1 px at 3 Hz does in simulated movies
+_HIDES_PX = 0.5  # root mean square from which on shake hides the commands; 1 px at 3 Hz does in simulated movies
 _STILL = 0.15  # of the speed that the log drives
 _CARRIED = 0.8  # share of the motion that the flow explains, from which on the body is not driven
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """Observations of a body that the log does not explain.
-
-    Attributes
-    ----------
-    time_s, positions_um : (n,) and (n, 2) of the images in which it was seen.
-    shake_px : root mean square of the images' motion against the walls; None: it can not be measured.
-    stabilised : that motion is taken out of the positions.
-    um_per_px : of the camera.
-    doubts : about the track.
-    """
-
-    time_s: Floats
-    positions_um: Floats
-    shake_px: float | None
-    stabilised: bool
-    um_per_px: float
-    doubts: Sequence[str]
-
-
-def why_unexplained(seen: Evidence, log: FieldLog, flow: FlowField, um_per_rev: float) -> str:
+def why_unexplained(seen: MovieTracks, flow: FlowField, um_per_rev: float) -> str:
     """The most probable reason, with what to do, as words after a colon."""
-    known = _shake(seen) or why_still(seen, log, um_per_rev)
+    known = _shake(seen) or why_still(seen, um_per_rev)
     if known:
         return known
     if seen.doubts:
@@ -66,9 +55,9 @@ def why_unexplained(seen: Evidence, log: FieldLog, flow: FlowField, um_per_rev: 
     if len(velocity) < _LEAST_WINDOWS:
         return "the robot is seen too seldom in one piece to compare it with a log; take a longer movie"
     image_s = float(np.median(np.diff(seen.time_s)))
-    row_s = sampled_s(log, image_s)
+    row_s = sampled_s(seen.log, image_s)
     if row_s is not None:
-        fastest_hz = float(log.frequency_hz.max())
+        fastest_hz = float(seen.log.frequency_hz.max())
         return (
             f"it is sampled too slowly, at {1.0 / row_s:.3g} Hz where the movie has {1.0 / image_s:.3g} and the field "
             f"turns at up to {fastest_hz:.3g} Hz, so it lacks commands; or it is the log of another run: log every "
@@ -86,9 +75,10 @@ def why_unexplained(seen: Evidence, log: FieldLog, flow: FlowField, um_per_rev: 
     )
 
 
-def why_still(seen: Evidence, log: FieldLog, um_per_rev: float) -> str:
+def why_still(seen: MovieTracks, um_per_rev: float) -> str:
     """Text about a body that goes much slower than the log drives it; '' if it does not."""
     _, velocity = _velocities(seen.time_s, seen.positions_um)
+    log = seen.log
     turning = log.frequency_hz[(log.amplitude_mt > 0.0) & (log.frequency_hz > 0.0)]
     if len(velocity) < _LEAST_WINDOWS or not turning.size:
         return ""
@@ -101,16 +91,16 @@ def why_still(seen: Evidence, log: FieldLog, um_per_rev: float) -> str:
     )
 
 
-def _shake(seen: Evidence) -> str:
+def _shake(seen: MovieTracks) -> str:
     if seen.shake_px is not None:
-        if seen.shake_px < _SHAKES_PX or seen.stabilised:
+        if seen.shake_px < _HIDES_PX or seen.stabilised:
             return ""
         return (
             f"the image shakes by {seen.shake_px:.1f} px (root mean square) against the walls of the chip, and "
             "stabilise.on = false leaves that in the track; import it with stabilise.on = true"
         )
     trembles_px = trembling(seen.positions_um) / seen.um_per_px
-    if trembles_px < _SHAKES_PX:
+    if trembles_px < _HIDES_PX:
         return ""
     return (
         f"the track trembles by {trembles_px:.1f} px from image to image: the stage or the camera shakes, and the "
@@ -136,7 +126,7 @@ def _velocities(time_s: Floats, positions_um: Floats) -> tuple[Floats, Floats]:
     return 0.5 * (time_s[ends[1:]] + time_s[ends[:-1]])[whole], velocity
 
 
-def _carried_share(middle_s: Floats, velocity: Floats, seen: Evidence, flow: FlowField) -> float:
+def _carried_share(middle_s: Floats, velocity: Floats, seen: MovieTracks, flow: FlowField) -> float:
     """Share of the mean square velocity that the assumed flow explains, with a factor of its own."""
     at = np.column_stack([np.interp(middle_s, seen.time_s, seen.positions_um[:, axis]) for axis in (0, 1)])
     carried = np.array([sample(flow, point) for point in at])
@@ -145,3 +135,37 @@ def _carried_share(middle_s: Floats, velocity: Floats, seen: Evidence, flow: Flo
         return 0.0
     factor = max(float((carried * velocity).sum()) / size, 0.0)
     return 1.0 - float(((velocity - factor * carried) ** 2).sum()) / float((velocity**2).sum())
+
+
+def motion_by_log(seen: MovieTracks, config: ResolvedConfig) -> MotionVerdict:
+    """Compare the track of a robot with the axes of a log; they agree with a log that hardly drives it."""
+    late_ns = nanoseconds(config.robot.delay_s)
+    own_um = config.robot.um_per_rev * seen.log.turns_until((seen.stamps_ns - late_ns).astype(np.float64))
+    if not len(own_um) or float(np.ptp(own_um, axis=0).max()) < config.robot.radius_um:
+        return MotionVerdict(AxesVerdict.AGREES)
+    return orientation_by_motion(*own_gain(seen.time_s, seen.positions_um, own_um))
+
+
+def orientation_of_heading(offset_rad: float, *, mirrored: bool) -> Orientation:
+    """The orientation nearest to a heading offset, as `MotionFit` states it."""
+    return nearest(Calibration(1.0, angle_deg=math.degrees(offset_rad), mirror=mirrored).axes)
+
+
+def may_be_image(orientation: Orientation, image: ImageVerdict, config: ResolvedConfig, chip: Chip) -> bool:
+    """True if the image may be turned so, and not the log: the chip would look the same."""
+    return not image.alike or orientation.in_image(registration_of(config.camera, chip)) in image.alike
+
+
+def turned_log(orientation: Orientation, image: ImageVerdict, config: ResolvedConfig, chip: Chip) -> ChipError:
+    """The refusal of a log against which the robot moves in another orientation."""
+    stated = registration_of(config.camera, chip) if may_be_image(orientation, image, config, chip) else None
+    settings = _log_settings(orientation, config.movie)
+    return ChipError(f"{config.movie.coils}: {contradiction(orientation, 'the log', settings, stated)}{UNCHECKED}")
+
+
+def _log_settings(orientation: Orientation, movie: MovieSettings) -> str:
+    """The settings movie.heading_* with which the log is right."""
+    offset_deg = -movie.heading_offset_deg if orientation.mirrored else movie.heading_offset_deg
+    offset_deg = 180.0 - (180.0 - offset_deg - orientation.turned_deg) % 360.0
+    mirrored = str(movie.heading_mirrored != orientation.mirrored).lower()
+    return f"movie.heading_mirrored = {mirrored}, movie.heading_offset_deg = {offset_deg:g}"

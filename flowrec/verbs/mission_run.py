@@ -16,12 +16,10 @@ from flowrec.core import (
     ClockMonitor,
     Coverage,
     Figures,
-    FlowField,
     Outcome,
     Output,
     SessionError,
     Tick,
-    UsageError,
     View,
     as_text,
     doubts_text,
@@ -47,26 +45,28 @@ from flowrec.stages import (
     MOVIE,
     RIGS,
     Config,
-    ResolvedConfig,
     RunStatistics,
     extra_rows,
-    scale_doubt,
 )
 from flowrec.store import SessionWriter, session_writer
-from flowrec.verbs.admission import admit
-from flowrec.verbs.axes import checked_image
+from flowrec.verbs.admission import admit, rehearse_aloud
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.mission_files import field_of_session, files_of, place_of_session
-from flowrec.verbs.preparation import Prepared, prepare
-from flowrec.verbs.rehearsal import rehearse_aloud
-from flowrec.verbs.run_summary import GOOD_ENDS, Recorded, figures_of, files_text, judges_of
+from flowrec.verbs.preparation import (
+    Prepared,
+    checked_image,
+    field_of_session,
+    files_of,
+    guard_timeout_s,
+    place_of_session,
+    prepare,
+)
+from flowrec.verbs.run_summary import GOOD_ENDS, Recorded, figures_of, files_text, judge_refinement, judges_of
 from flowrec.verbs.watching import Watching
 
 # Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
 CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
 VIEW_TIMEOUT_S = 0.2  # for a viewer to show the last messages
 _GIVE_UP_TIMEOUT_S = 1.0  # to close the file while the main thread hangs
-_LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
 
 
 def run_mission(
@@ -112,7 +112,7 @@ def run_mission(
     prepared = prepare(config, known=known)
     resolved = prepared.config
     realtime = realtime or "realtime" in RIGS[resolved.rig].needs
-    timeout_s = _guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
+    timeout_s = guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
     output = Output(place_of_session(resolved, out, overwrite), MCAP, inputs, overwrite)
     if view == "rrd":
         Output(output.path.with_suffix(RRD[0]), RRD, inputs, overwrite).check()
@@ -123,11 +123,10 @@ def run_mission(
         mission.connect(stack)
         mission.open_file(stack, keep_failed)
         watching = stack.enter_context(mission.watching(view, console))
-        report = mission.fly(watching.sinks)
-        facts = mission.figures(report, given_doubts)
-        ended = mission.close_file(report, facts)
+        mission.fly(watching.sinks)
+        ended = mission.close_file(given_doubts)
         watching.close(ended, VIEW_TIMEOUT_S if mission.run_control.reason else None)
-    recorded = mission.result(report, facts)
+    recorded = mission.result()
     if view == "rrd":
         _export_rrd(recorded, mission.run_control, overwrite)
     return recorded
@@ -139,6 +138,8 @@ class _Mission:
     _worker: Worker
     _writer: SessionWriter
     _disk: DiskMonitor
+    _report: RunReport
+    _facts: Figures
 
     def __init__(
         self,
@@ -233,7 +234,7 @@ class _Mission:
             lambda: {"disk": disk.text, "file_mb": writer.bytes_written / 1e6, "duration_s": duration_s},
         )
 
-    def fly(self, displays: Sequence[Sink]) -> RunReport:
+    def fly(self, displays: Sequence[Sink]) -> None:
         """Run the loop until the mission ends."""
         writer = self._writer
         # A run that is not in real time never waits: with real-time priority it would occupy a core.
@@ -245,7 +246,7 @@ class _Mission:
                 show(tick)
                 _report_remarks(writer)
 
-            report = run(
+            self._report = run(
                 self._pipeline,
                 self._rig,
                 self._worker,
@@ -261,11 +262,10 @@ class _Mission:
         if self._realtime:
             granted = {"loop_priority": first, "writer_priority": writes_first}
             self._priorities = {name: "real time" if each else "ordinary" for name, each in granted.items()}
-        return report
 
-    def figures(self, report: RunReport, given_doubts: Sequence[str]) -> Figures:
+    def _figures(self, given_doubts: Sequence[str]) -> Figures:
         """Figures of the run, with the reasons to doubt it."""
-        config, rig, walls = self._config, self._rig, self._prepared.walls
+        config, rig, walls, report = self._config, self._rig, self._prepared.walls, self._report
         facts = figures_of(self._chip, report, self._statistics.true_field)
         # Without navigation, and for a control law that descends the time to go, there is no reference.
         if not (config.mission.observes or config.control.needs):
@@ -273,7 +273,7 @@ class _Mission:
         if self._control.note:
             facts["note_not_finished"] = self._control.note
         doubted = [walls.text] if walls is not None and walls.other_scale else []
-        refinement_facts, refinement_doubts = _judge_refinement(report.last.refined, config, known_doubts=bool(doubted))
+        refinement_facts, refinement_doubts = judge_refinement(report.last.refined, config, known_doubts=bool(doubted))
         facts |= refinement_facts
         doubted += refinement_doubts
         if isinstance(rig, MovieRig):
@@ -286,40 +286,31 @@ class _Mission:
             facts[DOUBTS] = doubts
         return facts
 
-    def close_file(self, report: RunReport, facts: Figures) -> RunEnded:
+    def close_file(self, given_doubts: Sequence[str]) -> RunEnded:
         """Close the file with its outcome; soon, if the run was stopped."""
-        writer = self._writer
-        outcome = as_text(facts) | self._clocks.outcome() | self._priorities
+        writer, report = self._writer, self._report
+        self._facts = self._figures(given_doubts)
+        outcome = as_text(self._facts) | self._clocks.outcome() | self._priorities
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
         writer.close(outcome, CLOSE_TIMEOUT_S if self.run_control.reason else None, why=bad)
         _report_remarks(writer)
         told = report.outcome + (f" ({report.note})" if report.note else "")
         return RunEnded(told, files_text(self._output.path, tuple(writer.files)), good=not bad)
 
-    def result(self, report: RunReport, facts: Figures) -> Recorded:
+    def result(self) -> Recorded:
         """The result, after all is closed."""
-        facts["frames_dropped"] = self._writer.dropped_frames  # the writer has added it to the outcome of the file
-        path, files, made = self._output.path, tuple(self._writer.files), self._prepared.derived
-        lost, stopped = (self._low[0] if self._low else ""), bool(self.run_control.reason)
-        return Recorded(path, report, facts, files, made, lost, stopped, self._source, self._covered)
-
-
-def _judge_refinement(
-    refined: FlowField | None, config: ResolvedConfig, *, known_doubts: bool
-) -> tuple[dict[str, str], list[str]]:
-    """Facts and doubts about the refined flow of a run; its scale is not doubted again if the walls' is."""
-    facts: dict[str, str] = {}
-    doubts: list[str] = []
-    if refined is None:
-        return facts, doubts
-    if not known_doubts and (scale := scale_doubt(refined, config.camera.um_per_px)):
-        doubts.append(scale)
-    if refined.refused and refined.log_score is None:
-        if config.refine.observes_flow:
-            doubts.append(f"the flow was not refined: {refined.refused}")
-        else:  # a movie without a log: nothing was asked that was not done
-            facts["not_refined"] = f"because {refined.refused}"
-    return facts, doubts
+        self._facts["frames_dropped"] = self._writer.dropped_frames  # the writer has added it to the file's outcome
+        return Recorded(
+            self._output.path,
+            self._report,
+            self._facts,
+            tuple(self._writer.files),
+            self._prepared.derived,
+            self._low[0] if self._low else "",
+            bool(self.run_control.reason),
+            self._source,
+            self._covered,
+        )
 
 
 def _export_rrd(recorded: Recorded, control: RunControl, overwrite: bool) -> None:
@@ -331,17 +322,6 @@ def _export_rrd(recorded: Recorded, control: RunControl, overwrite: bool) -> Non
 
     for name in recorded.sessions:
         recorded.facts["rrd"] = str(export(name, overwrite=overwrite))
-
-
-def _guard_timeout_s(config: ResolvedConfig) -> float:
-    """The timeout of the watchdog in s; UsageError if it is shorter than a few frames of the camera."""
-    timeout_s, rate_hz = config.safety.guard_timeout_s, config.camera.rate_hz
-    if timeout_s * rate_hz < _LEAST_FRAMES:
-        raise UsageError(
-            f"safety.guard_timeout_s = {timeout_s:g}: shorter than {_LEAST_FRAMES:g} frames at camera.rate_hz = "
-            f"{rate_hz:g}; the nearest that works is {_LEAST_FRAMES / rate_hz:.3g}"
-        )
-    return timeout_s
 
 
 def _close_in_thread(opened: list[SessionWriter], reason: str) -> str:

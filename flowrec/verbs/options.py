@@ -43,16 +43,21 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 # Verbs that rooms above this one bring: "module:name", imported by name so that no arrow leads upwards.
 ABOVE = {
-    "sweep": "flowrec.archive.sweep_verb:sweep",
-    "push": "flowrec.archive.push_verb:push",
-    "catalog": "flowrec.archive.catalog_verb:catalog",
-    "find": "flowrec.archive.find_verb:find",
+    "sweep": "flowrec.archive.verbs:sweep",
+    "push": "flowrec.archive.verbs:push",
+    "catalog": "flowrec.archive.verbs:catalog",
+    "find": "flowrec.archive.verbs:find",
     "report_sweep": "flowrec.archive.sweep.sweep_report:report_sweep",
     "bench": "flowrec.bench.bench_verb:bench",
 }
 
 OUR_VERBS: set[str] = set()  # names of the commands: cli.py adds them, and no package of others may take one
 HELP_WIDTH = 110  # characters, on a terminal as wide as that
+HELP_SETTINGS: dict[str, Any] = {  # of an app of typer
+    "context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},
+    "pretty_exceptions_enable": False,
+    "rich_markup_mode": None,  # frames around the help would take as long to draw as all the rest
+}
 _LONGEST_DESCRIPTION = 1000  # characters: longer than any
 
 

@@ -1,23 +1,31 @@
-"""Preparation of a run before its rig is touched: a resolved configuration, and a mission that is feasible."""
+"""Preparation of a run before its rig is touched: its files, its resolved settings, and a mission that is feasible."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from flowrec.core import (
+    ChipError,
+    FlowField,
+    Image,
     MovieError,
     Phase,
+    SessionError,
     UnreachableError,
     UsageError,
     say,
     warn,
 )
-from flowrec.measure import ImageVerdict
+from flowrec.measure import ImageVerdict, orientation_by_image
 from flowrec.physics import Chip, load_chip, median_width_um
 from flowrec.rigs import fitted_to_movie, open_source
+from flowrec.run import refuse_below
 from flowrec.stages import (
     MOVIE,
     SAMPLERS,
@@ -32,10 +40,15 @@ from flowrec.stages import (
     swept_out,
     too_swift,
 )
-from flowrec.verbs.axes import checked_image
+from flowrec.store import Session, files_behind, run_files, run_path, runs_in
+from flowrec.verbs.auto_recovery import recover_leftovers
 
 if TYPE_CHECKING:
     from flowrec.measure import WallsState
+
+
+_LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
+UNCHECKED = "; mission.check_axes = false records without this check"
 
 
 class Prepared(NamedTuple):
@@ -133,6 +146,19 @@ def _looked_at(config: ResolvedConfig, chip: Chip) -> tuple[ImageVerdict | None,
     return verdict, walls_state(image, chip, registration_of(config.camera, chip))
 
 
+def checked_image(image: Image, config: ResolvedConfig, chip: Chip, where: str) -> ImageVerdict | None:
+    """Compare an image (h, w) with the stated registration; None if mission.check_axes is off.
+
+    Raises ChipError, in one line with the settings to paste, where it contradicts.
+    """
+    if not config.mission.check_axes:
+        return None
+    verdict = orientation_by_image(image, chip, registration_of(config.camera, chip))
+    if verdict.contradiction:
+        raise ChipError(f"{where}: {verdict.contradiction}{UNCHECKED}")
+    return verdict
+
+
 def _unsaid(_text: str) -> None:
     """In place of `say`."""
 
@@ -162,3 +188,69 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
     reason = swept_out(chip, field, start, course_error, 0.0 if config.mission.hold_start_s else config.coils.ramp_s)
     if reason:
         raise UnreachableError(f"unreachable: {reason}")
+
+
+def files_of(config: Config) -> list[Path]:
+    """The files that a configuration names, and those that are read with them."""
+    files: list[Path] = []
+    chip = Path(config.chip.path)
+    if chip.name:
+        files += [chip, chip.with_suffix(".png"), chip.with_suffix(".toml")]
+    if config.start.field:
+        files += files_behind(Path(config.start.field))
+    movie = config.movie
+    return [*files, *(Path(name) for name in (movie.path, movie.times, movie.coils) if name)]
+
+
+def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
+    """Assumed and refined flow at the end of an earlier session, on the same chip."""
+    fields = {name: field for name, field in Session(path).fields.items() if name != "true"}
+    if "assumed" not in fields:
+        raise UsageError(f"start.field = {path}: that session holds no flow field; survey and refine first")
+    shape = fields["assumed"].velocity_um_s.shape[:2]
+    if shape != chip.mask.shape or not math.isclose(fields["assumed"].um_per_px, chip.um_per_px):
+        raise UsageError(f"start.field = {path}: its field is for another chip ({shape[1]} x {shape[0]} pixels)")
+    return fields
+
+
+def place_of_session(config: Config, out: Path | None, overwrite: bool) -> Path:
+    """The path of the session, after unfinished sessions in its folder are recovered and the free space is checked."""
+    folder = out.parent if out is not None else Path()
+    made: dict[Path, str] = {}
+    if config.recording.recover_leftovers:
+        excluded = frozenset(run_files(out.resolve())) if out is not None and overwrite else frozenset()
+        made = recover_leftovers(folder, excluded)
+    path = out if out is not None else default_path(config)
+    same = next((file for file in made if run_path(file) == path), None)
+    if same is not None and not overwrite:
+        raise SessionError(
+            f"{same}: was left by a run that did not finish and has just been recovered ({made[same]}); "
+            "choose another name for this run with --out"
+        )
+    refuse_below(config.recording.disk_floor_gb, path.resolve().parent)
+    return path
+
+
+def default_path(config: Config, folder: Path | None = None) -> Path:
+    """The path date_operator_sample_number.mcap with the first free number."""
+    sample = config.recording.sample or Path(config.chip.path).stem or config.chip.name
+    words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
+    stem = "_".join(word.replace(" ", "-") for word in words if word)
+    folder = folder or Path()
+    names = runs_in(folder)
+    for number in range(1, 10_000):
+        path = folder / f"{stem}_{number:03d}.mcap"
+        if path not in names:
+            return path
+    raise SessionError(f"{folder}: 9999 sessions named {stem} are here; name one with --out")
+
+
+def guard_timeout_s(config: ResolvedConfig) -> float:
+    """The timeout of the watchdog in s; UsageError if it is shorter than a few frames of the camera."""
+    timeout_s, rate_hz = config.safety.guard_timeout_s, config.camera.rate_hz
+    if timeout_s * rate_hz < _LEAST_FRAMES:
+        raise UsageError(
+            f"safety.guard_timeout_s = {timeout_s:g}: shorter than {_LEAST_FRAMES:g} frames at camera.rate_hz = "
+            f"{rate_hz:g}; the nearest that works is {_LEAST_FRAMES / rate_hz:.3g}"
+        )
+    return timeout_s

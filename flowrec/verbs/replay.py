@@ -20,8 +20,7 @@ DEFAULT_REFINE = "pi_unet"
 def _output_of(asked: Asked, done: "Replay") -> Told:
     session: Path = asked["session"]
     if asked["verify"]:
-        told = Told.of(done)
-        return told._replace(as_json=lambda: {"session": str(session), **done.as_json()})
+        return Told.of(done, session=session)
     covered = done.covered
     return Told(
         lambda: {"session": str(session), "out": str(done.file), **done.changes_as_json()},
@@ -123,6 +122,6 @@ def replay(
         frames=frames,
         control=control,
         numbered=numbered,
-        refly=refly,
+        fly=refly,
         rrd=view == "rrd",
     )

@@ -11,12 +11,12 @@ from __future__ import annotations
 import os
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowrec.core import NUMERICS_VERSION, SessionError, Tick, UsageError, pool
-from flowrec.run import CommandDifference, RunControl, RunReport
+from flowrec.run import CommandDifference, RunReport
 from flowrec.stages import other_packages
 from flowrec.store import Session
 from flowrec.verbs.comparison import Comparison, Side
@@ -32,8 +32,7 @@ _POLL_S = 0.2  # until a request to stop is seen
 Segment = tuple[int | None, int]  # stamps of the first and the last tick; None: the beginning of the session
 
 
-@dataclass(frozen=True, slots=True)
-class _Verified:
+class _Verified(NamedTuple):
     """A segment's result, without the session, which the caller has."""
 
     report: RunReport
@@ -64,7 +63,8 @@ def verify(
     jobs = jobs or os.cpu_count() or 1
     session, control = Session.of(session), control or Unattended()
     packages = other_packages(session.config, session.provenance)
-    segments = _segments(session, jobs, from_s) if jobs > 1 else []
+    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
+    segments = _segments(session, jobs, start_ns) if jobs > 1 else []
     if len(segments) < 2:
         return replay_session(session, from_s=from_s, verify=True, control=control)
     tasks: list[Future[_Verified]] = []
@@ -91,10 +91,26 @@ def verify(
     except _StoppedError:
         pass
     found = [task.result() for task in tasks if _has_succeeded(task)]
-    known = digest.result() if digest is not None and _has_succeeded(digest) else None
-    joined = _join_segments(session, found, known, from_s, stopped)
-    joined.packages = packages
-    return joined
+    sides = Side.of("recorded", session), Side.of_replay(session.reader.topics)
+    comparison, worker = Comparison(sides=sides), WorkerResults(Comparison(sides=sides))
+    for each in found:
+        comparison.followed_by(each.comparison)
+        worker.followed_by(each.worker)
+    report = replace(found[-1].report if found else RunReport(), ticks=comparison.ticks, duration_s=session.duration_s)
+    return Replayed(
+        session,
+        session.config,
+        report,
+        found[-1].recorded if found else Tick(),
+        report.last,
+        comparison,
+        CommandDifference(),
+        sum(each.frames_missing for each in found),
+        coverage_of(session, comparison.ticks, (start_ns, session.reader.last_ns), from_s, stopped),
+        worker,
+        digest.result() if digest is not None and _has_succeeded(digest) else None,
+        packages=packages,
+    )
 
 
 class _StoppedError(Exception):
@@ -105,9 +121,8 @@ def _has_succeeded(task: Future[Any]) -> bool:
     return task.done() and not task.cancelled() and task.exception() is None
 
 
-def _segments(session: Session, jobs: int, from_s: float | None) -> list[Segment]:
+def _segments(session: Session, jobs: int, start_ns: int | None) -> list[Segment]:
     """Segments of about equal numbers of ticks, a few for each job."""
-    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
     if session.numerics != str(NUMERICS_VERSION):
         return []  # today's stages compute from more than an older file states, so it can not be entered anywhere
     stamps = [stamp_ns for stamp_ns in session.reader.stamps("applied") if stamp_ns >= (start_ns or 0)]
@@ -124,34 +139,3 @@ def _verify_segment(path: Path, segment: Segment) -> _Verified:
     done = replay_session(path, verify=True, segment_ns=segment)
     assert done.worker is not None
     return _Verified(done.report, done.recorded, done.comparison, done.worker, done.frames_missing)
-
-
-def _join_segments(
-    session: Session,
-    found: list[_Verified],
-    digest: tuple[bool, list[str]] | None,
-    from_s: float | None,
-    stopped: RunControl,
-) -> Replayed:
-    """The segments that are done, in order, as one replay."""
-    sides = Side.of("recorded", session), Side.of_replay(session.reader.topics)
-    comparison, worker = Comparison(sides=sides), WorkerResults(Comparison(sides=sides))
-    for each in found:
-        comparison.followed_by(each.comparison)
-        worker.followed_by(each.worker)
-    report = replace(found[-1].report if found else RunReport(), ticks=comparison.ticks, duration_s=session.duration_s)
-    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
-    between_ns = start_ns, session.reader.last_ns
-    return Replayed(
-        session,
-        session.config,
-        report,
-        found[-1].recorded if found else Tick(),
-        report.last,
-        comparison,
-        CommandDifference(),
-        sum(each.frames_missing for each in found),
-        coverage_of(session, comparison.ticks, between_ns, from_s, stopped),
-        worker,
-        digest,
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,7 +15,6 @@ from flowrec.core import (
     Output,
     OutputFolder,
     Row,
-    Tick,
     UsageError,
     doubts_of,
     name_of,
@@ -30,11 +28,12 @@ from flowrec.store import Session, files_behind, input_blamed, named_beside, ses
 from flowrec.verbs.check import check
 from flowrec.verbs.info import facts_for_people, info
 from flowrec.verbs.replay_change import OF_EVERY_REPLAY
-from flowrec.verbs.replay_report import refinement_remarks
+from flowrec.verbs.replay_made import refinement_remarks
+from flowrec.verbs.session_parts import flat
 from flowrec.verbs.verdict import Verdict
 
 if TYPE_CHECKING:
-    from flowrec.exports import Page, Remark, ReplayPart, ReportData, ReportFigure, ReportTable
+    from flowrec.exports import Page, ReplayPart, ReportData, ReportFigure, ReportTable
 
 HTML = (".html", ".htm")
 _PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
@@ -297,32 +296,32 @@ def _events(data: ReportData) -> list[ReportTable]:
     from flowrec.exports import ReportTable, numbered_actions
 
     history = data.history
-    tables = []
-    actions = [
-        (number, f"{each.time_s:.2f} s", each.action, each.text) for number, each in numbered_actions(history.remarks)
+    tables: list[ReportTable] = []
+
+    def add(title: str, rows: Sequence[tuple[Any, ...]], columns: tuple[str, ...], left_out: int = 0) -> None:
+        more = max(len(rows) - _EVENTS, 0) + left_out
+        note = f"The first {_EVENTS} of {len(rows) + left_out}; the session holds all." if more else ""
+        if rows:
+            tables.append(ReportTable(title, rows[:_EVENTS], columns, note))
+
+    add(
+        "The operator",
+        [
+            (number, f"{each.time_s:.2f} s", each.action, each.text)
+            for number, each in numbered_actions(history.remarks)
+        ],
+        ("number", "time", "action", "text"),
+    )
+    events = [
+        (f"{each.time_s:.2f} s", each.text if each.level == Level.INFO else f"{each.level}: {each.text}")
+        for each in history.remarks
+        if not each.action
     ]
-    if actions:
-        columns = ("number", "time", "action", "text")
-        tables.append(ReportTable("The operator", actions[:_EVENTS], columns, _more(len(actions), 0)))
-    events = [(f"{each.time_s:.2f} s", _event(each)) for each in history.remarks if not each.action]
-    if events:
-        note = _more(len(events), history.remarks_left_out)
-        tables.append(ReportTable("Events", events[:_EVENTS], ("time", "event"), note))
-    phases = [(span.name, f"{span.from_s:.2f} s", f"{span.to_s - span.from_s:.2f} s") for span in history.phases.spans]
-    if phases:
-        tables.append(
-            ReportTable("Phases of the mission", phases[:_EVENTS], ("phase", "from", "for"), _more(len(phases), 0))
-        )
+    add("Events", events, ("time", "event"), history.remarks_left_out)
+    spans = history.phases.spans
+    phases = [(span.name, f"{span.from_s:.2f} s", f"{span.to_s - span.from_s:.2f} s") for span in spans]
+    add("Phases of the mission", phases, ("phase", "from", "for"))
     return tables
-
-
-def _event(remark: Remark) -> str:
-    return remark.text if remark.level == Level.INFO else f"{remark.level}: {remark.text}"
-
-
-def _more(count: int, left_out: int) -> str:
-    missing = max(count - _EVENTS, 0) + left_out
-    return f"The first {_EVENTS} of {count + left_out}; the session holds all." if missing else ""
 
 
 def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]]:
@@ -337,7 +336,9 @@ def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]
 def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
     from flowrec.exports import MEANINGS, ReplayPart, ReportTable
 
-    stated: Row = ("stated_flow_error", _stated_error(pair.recorded), _stated_error(pair.replayed))
+    # The error that the best map states for itself.
+    was, now = (tick.field.error_share if tick.field is not None else None for tick in (pair.recorded, pair.replayed))
+    stated: Row = ("stated_flow_error", was, now)
     texts = [
         (name_of(key), _micro(text_of_figure(key, was)), _micro(text_of_figure(key, now)), MEANINGS.get(key, ""))
         for key, was, now in [*before_after(pair), stated]
@@ -351,16 +352,11 @@ def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
     return ReplayPart(pair.replay.path.name, tables, refinement_remarks(pair), figure)
 
 
-def _stated_error(tick: Tick) -> float | None:
-    """The error that the best map states for itself."""
-    return tick.field.error_share if tick.field is not None else None
-
-
 def _changed_settings(pair: ReplayFiles) -> list[tuple[str, str, str]]:
     """Settings, weights and versions of the code that differ."""
     sides = []
     for each in (pair.session, pair.replay):
-        settings = dict(_flat(toml_table(each.header.config_toml, f"{each.path}: config.toml inside"), ""))
+        settings = dict(flat(toml_table(each.header.config_toml, f"{each.path}: config.toml inside")))
         code = {
             key: text
             for key, text in each.provenance.items()
@@ -370,14 +366,6 @@ def _changed_settings(pair: ReplayFiles) -> list[tuple[str, str, str]]:
     was, now = sides
     keys = [key for key in was | now if key not in OF_EVERY_REPLAY and was.get(key) != now.get(key)]
     return [(key, was.get(key, "-")[:80], now.get(key, "-")[:80]) for key in keys[:_LINES]]
-
-
-def _flat(tree: dict[str, Any], prefix: str) -> Iterator[tuple[str, str]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def _cut(lines: list[str]) -> list[str]:

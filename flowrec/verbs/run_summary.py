@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from flowrec.core import DOUBTS, Coverage, Figures, FlowField, Outcome, doubts_of, rows_for_people, say, table, warn
 from flowrec.physics import Chip
 from flowrec.run import RunReport
-from flowrec.stages import MotionOfRun, Pipeline, TrackQuality
+from flowrec.stages import MotionOfRun, Pipeline, ResolvedConfig, TrackQuality, scale_doubt
 from flowrec.stages import figures_of as figures_of_ticks
 from flowrec.store import is_snapshot
 
@@ -67,6 +68,30 @@ class Recorded:
         """Reasons to doubt the result; none if there is no reason."""
         return doubts_of(self.facts)
 
+    def as_json(self) -> dict[str, Any]:
+        """For JSON."""
+        derived = {"derived": dict(self.derived), "files": [*map(str, self.files)]}
+        return {"path": str(self.path), **self.facts, **derived}
+
+    def show(self) -> None:
+        """Print the table at the end of a run, and what to do next."""
+        files = ("file", files_text(self.path, self.files))
+        facts = {key: value for key, value in self.facts.items() if key != DOUBTS}  # they are told below
+        table("Session", ("", "value"), [*rows_for_people(facts), files])
+        sessions, report, covered = self.sessions, self.report, self.covered
+        if self.lost:
+            say(
+                f"flowrec: the run was ended early, its file is whole: {self.lost}; free some space before the next one"
+            )
+        elif covered is not None and covered.stopped:
+            say(f"flowrec: {covered.text}; the session holds those, and no more is known of the movie")
+        elif report.outcome not in GOOD_ENDS and sessions:
+            say(f"flowrec: the mission ended {report.outcome}: {report.note}; see flowrec view {sessions[-1]}")
+        for doubt in self.doubts:
+            warn(f"doubtful: {doubt}")
+        if sessions:
+            say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")
+
 
 def judges_of(pipeline: Pipeline) -> tuple[TrackQuality, MotionOfRun]:
     """Sinks of the ticks of a run, whose `doubts` are then the reasons to doubt its track and its axes."""
@@ -85,6 +110,24 @@ def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> F
     return ran | figures_of_ticks(chip, report.last, true_field, report.contacts, report.navigating_ns)
 
 
+def judge_refinement(
+    refined: FlowField | None, config: ResolvedConfig, *, known_doubts: bool
+) -> tuple[dict[str, str], list[str]]:
+    """Facts and doubts about the refined flow of a run; its scale is not doubted again if the walls' is."""
+    facts: dict[str, str] = {}
+    doubts: list[str] = []
+    if refined is None:
+        return facts, doubts
+    if not known_doubts and (scale := scale_doubt(refined, config.camera.um_per_px)):
+        doubts.append(scale)
+    if refined.refused and refined.log_score is None:
+        if config.refine.observes_flow:
+            doubts.append(f"the flow was not refined: {refined.refused}")
+        else:  # a movie without a log: nothing was asked that was not done
+            facts["not_refined"] = f"because {refined.refused}"
+    return facts, doubts
+
+
 def files_text(path: Path, files: tuple[Path, ...]) -> str:
     """Names and sizes of the files of a run, as text."""
     if not files:
@@ -94,23 +137,3 @@ def files_text(path: Path, files: tuple[Path, ...]) -> str:
         return f"{files[0]} ({size})"
     kind = "snapshots" if is_snapshot(files[0]) else "parts"
     return f"{len(files)} {kind}, {files[0]} to {files[-1].name} ({size} in all)"
-
-
-def print_summary(recorded: Recorded) -> None:
-    """Print the table at the end of a run, and what to do next."""
-    files = ("file", files_text(recorded.path, recorded.files))
-    facts = {key: value for key, value in recorded.facts.items() if key != DOUBTS}  # they are told below
-    table("Session", ("", "value"), [*rows_for_people(facts), files])
-    sessions, report, covered = recorded.sessions, recorded.report, recorded.covered
-    if recorded.lost:
-        say(
-            f"flowrec: the run was ended early, its file is whole: {recorded.lost}; free some space before the next one"
-        )
-    elif covered is not None and covered.stopped:
-        say(f"flowrec: {covered.text}; the session holds those, and no more is known of the movie")
-    elif report.outcome not in GOOD_ENDS and sessions:
-        say(f"flowrec: the mission ended {report.outcome}: {report.note}; see flowrec view {sessions[-1]}")
-    for doubt in recorded.doubts:
-        warn(f"doubtful: {doubt}")
-    if sessions:
-        say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")

@@ -7,12 +7,14 @@ ran; that is told as every other difference is, with the option that leaves it o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from heapq import merge
+from itertools import groupby, repeat
 from typing import Any
 
-from flowrec.core import Coverage, Ended, Role, printable, seconds
+from flowrec.core import Coverage, Ended, Role, Tick, printable, seconds
 from flowrec.store import Session, open_bytes
 from flowrec.verbs.comparison import Comparison, Difference, Side
 from flowrec.verbs.session_parts import (
@@ -78,15 +80,9 @@ class SessionComparison:
         return self.comparison.first
 
     @property
-    def _others_same(self) -> bool:
-        return not (
-            self.apart or any(part.differences for part in self.head) or any(wrong for _, wrong, _ in self.raw.values())
-        )
-
-    @property
     def same_so_far(self) -> bool:
         """Nothing that was compared differs beyond its tolerance."""
-        return self._others_same and self.comparison.same
+        return self.comparison.same and not self._different
 
     @property
     def same(self) -> bool | None:
@@ -96,8 +92,7 @@ class SessionComparison:
     @property
     def identical(self) -> bool | None:
         """True if `same` holds bit for bit; None as of `same`."""
-        alike = self._others_same and self.comparison.identical
-        return None if self.covered.stopped and alike else alike
+        return self.same if self.comparison.identical else False
 
     @property
     def exit_status(self) -> int:
@@ -131,20 +126,14 @@ class SessionComparison:
 
     @property
     def _verdict(self) -> str:
-        found = "identical" if self._others_same and self.comparison.identical else "the same within tolerance"
+        found = "identical" if self.comparison.identical else "the same within tolerance"
         if not self.same_so_far:
             other = self.comparison.other_numerics
             different = self._different
             more = [f"{len(different) - _NAMED} more"] if len(different) > _NAMED else []
             found = f"DIFFERENT in {', '.join([*different[:_NAMED], *more])}" + (f"; {other}" if other else "")
-        topics = len(self.covered.topics)
-        what = f"{topics} topic{'s' * (topics != 1)} and {self._parts_of_head} of the head"
+        what = f"{_counted(self.covered.topics, 'topic')} and {_counted(self.covered.head, 'part')} of the head"
         return f"{self.covered.sentence(found)} ({what}{self.choice.text})"
-
-    @property
-    def _parts_of_head(self) -> str:
-        count = len(self.covered.head)
-        return f"{count} part{'s' * (count != 1)}"
 
     @property
     def _different(self) -> list[str]:
@@ -176,7 +165,9 @@ def compare_sessions(
 ) -> SessionComparison:
     """Compare two sessions; parameters and errors as of `flowrec.compare`."""
     names = _names(*sessions)
-    found = SessionComparison(names, choice, Coverage(0, max(map(_ticks_of, sessions))))
+    found = SessionComparison(
+        names, choice, Coverage(0, max(each.reader.counts.get("applied", 0) for each in sessions))
+    )
     try:
         size_bytes = None if choice.text else _same_bytes(*sessions)
         if size_bytes is not None:
@@ -209,8 +200,8 @@ def _names(first: Session, second: Session) -> tuple[str, str]:
     return str(first.path), str(second.path)
 
 
-def _ticks_of(session: Session) -> int:
-    return session.reader.counts.get("applied", 0)
+def _counted(names: Sequence[str], noun: str) -> str:
+    return f"{len(names)} {noun}{'s' * (len(names) != 1)}"
 
 
 def _same_bytes(first: Session, second: Session) -> int | None:
@@ -324,22 +315,18 @@ def _compare_paired_ticks(
     comparison: Comparison, sessions: tuple[Session, Session], *, with_frames: bool
 ) -> Iterator[int]:
     """Compare tick by tick; yields the stamp of each in ns."""
-    ticks = [session.ticks(with_frames=with_frames) for session in sessions]
-    was, now = next(ticks[0], None), next(ticks[1], None)
-    while was is not None or now is not None:
-        if was is not None and now is not None and was.stamp_ns == now.stamp_ns:
-            comparison.add(was, now)
-            yield was.stamp_ns
-            was, now = next(ticks[0], None), next(ticks[1], None)
-        elif now is None or (was is not None and was.stamp_ns < now.stamp_ns):
-            assert was is not None
-            comparison.add_lone(was.stamp_ns, 0)
-            yield was.stamp_ns
-            was = next(ticks[0], None)
+    ticks = [zip(each.ticks(with_frames=with_frames), repeat(side)) for side, each in enumerate(sessions)]
+
+    def stamp_of(tick: tuple[Tick, int]) -> int:
+        return tick[0].stamp_ns
+
+    for stamp_ns, there in groupby(merge(*ticks, key=stamp_of), stamp_of):
+        (tick, side), *other = there
+        if other:
+            comparison.add(tick, other[0][0])
         else:
-            comparison.add_lone(now.stamp_ns, 1)
-            yield now.stamp_ns
-            now = next(ticks[1], None)
+            comparison.add_lone(stamp_ns, side)
+        yield stamp_ns
 
 
 def _by_nature(found: SessionComparison) -> tuple[str, ...]:

@@ -192,7 +192,6 @@ class RawTopic:
     def __init__(self) -> None:
         self.log_ns = array("q")
         self.hashes = array("Q")
-        self.declared: set[str] = set()
 
     def add(self, log_ns: int, payload: bytes) -> None:
         """Add a message."""

@@ -110,7 +110,9 @@ def replay_session(
         replay.show_progress(stack)
         result = replay.run(sinks)
         if writer is not None:
-            result.doubts = [doubt for judge in judges for doubt in judge.doubts()] + _scale_doubts(result)
+            refined = result.report.last.refined
+            scale = scale_doubt(refined, result.config.camera.um_per_px) if refined is not None else ""
+            result.doubts = [doubt for judge in judges for doubt in judge.doubts()] + [scale] * bool(scale)
             _close(writer, result)
     if verify and segment_ns is None:
         replay.read_digest(result)
@@ -267,12 +269,6 @@ def _between_ns(
         # A part of a run begins with a keyframe, whose inputs the part before holds.
         start_ns = max(start_ns or 0, keyframe_ns + 1)
     return start_ns, end_ns
-
-
-def _scale_doubts(result: Replayed) -> list[str]:
-    refined = result.report.last.refined
-    scale = scale_doubt(refined, result.config.camera.um_per_px) if refined is not None else ""
-    return [scale] if scale else []
 
 
 def _close(writer: SessionWriter, result: Replayed) -> None:

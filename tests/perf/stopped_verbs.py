@@ -56,10 +56,10 @@ class Verb:
 VERBS = {
     "verify": Verb("replay {a} --verify", "flowrec.verbs.session_replay"),
     "verify, 2 jobs": Verb("replay {a} --verify --jobs 2", "flowrec.verbs.replay_segments"),
-    "refine": Verb("replay {a} --refine gain -o {out}/r.mcap", "flowrec.verbs.replay_report", ("r.mcap",)),
+    "refine": Verb("replay {a} --refine gain -o {out}/r.mcap", "flowrec.verbs.replay_made", ("r.mcap",)),
     "refly": Verb(
         "replay {a} --refine gain --refly -o {out}/r.mcap",
-        "flowrec.verbs.replay_report",
+        "flowrec.verbs.replay_made",
         ("r.mcap", "r_refly.mcap"),
     ),
     "check": Verb("check {a}", "flowrec.verbs.check_run"),

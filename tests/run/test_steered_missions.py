@@ -20,7 +20,7 @@ from flowrec.store.reader import SessionReader
 from flowrec.verbs import record as verb
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.replay_change import Change
-from flowrec.verbs.replay_report import refly
+from flowrec.verbs.replay_made import refly
 from flowrec.verbs.session_replay import replay_session
 from tests.short_missions import SMALL
 

@@ -152,7 +152,7 @@ def test_a_machine_holds_what_both_its_ticks_and_its_disk_hold(held: Held, enoug
 SEEN = """
 import json, sys
 from numba.core.dispatcher import Dispatcher
-from flowrec.verbs.rehearsal import rehearse
+from flowrec.verbs.admission import rehearse
 from flowrec.verbs.replay_change import Change
 from flowrec.verbs.session_replay import replay_session
 from flowrec.stages.config import load_config

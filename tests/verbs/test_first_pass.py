@@ -17,8 +17,9 @@ from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.config import Config, load_config, to_toml
 from flowrec.stages.control.field_log import FieldLog
 from flowrec.verbs.cli import main
-from flowrec.verbs.misfit import Evidence, why_unexplained
+from flowrec.verbs.first_pass import MovieTracks
 from flowrec.verbs.misfit import trembling as trembling_um
+from flowrec.verbs.misfit import why_unexplained
 from tests.movies import makers
 from tests.stages.vision.shaky import ROBOT, UM_PER_PX, WIDTH, chip, image
 
@@ -142,12 +143,13 @@ def test_the_reason_why_a_log_does_not_explain_a_track_is_the_one_that_holds() -
     on = chip()
     flow = FlowSolver().solve(on)
     time_s = np.arange(0.0, 4.0, 1.0 / 30.0)
+    stamps_ns = np.rint(1e9 * time_s).astype(np.int64)
     log = FieldLog([0, 4_000_000_000], [10.0, 10.0], [0.0, 0.0], [4.0, 4.0])
     rng = np.random.default_rng(0)
 
     def why(places_um: np.ndarray, **seen: object) -> str:
         given = {"shake_px": 0.0, "stabilised": True, "um_per_px": UM_PER_PX, "doubts": ()} | seen
-        return why_unexplained(Evidence(time_s, places_um, **given), log, flow, 25.0)  # type: ignore[arg-type]
+        return why_unexplained(MovieTracks(stamps_ns, places_um, log, **given), flow, 25.0)  # type: ignore[arg-type]
 
     angle = np.repeat(rng.uniform(-3.0, 3.0, 8), 15)
     driven = np.array([400.0, 320.0]) + np.cumsum(

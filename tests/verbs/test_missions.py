@@ -14,7 +14,7 @@ from flowrec.stages.config import load_config
 from flowrec.store.reader import SessionReader
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.record import record
-from flowrec.verbs.replay_report import refly
+from flowrec.verbs.replay_made import refly
 from flowrec.verbs.run_summary import GOOD_ENDS, Recorded
 from tests.conftest import made_once
 from tests.short_missions import SMALL

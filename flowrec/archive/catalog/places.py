@@ -13,7 +13,7 @@ import glob
 import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from flowrec.archive.catalog.format import PARQUET
@@ -38,16 +38,8 @@ class Found:
     signature: str
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """Contents of places: sessions in order of name, and tables that may be those of sweeps."""
-
-    sessions: list[Found] = field(default_factory=list)
-    tables: list[Path] = field(default_factory=list)
-
-
-def contents_of(places: Iterable[Path], without: Path) -> Contents:
-    """List the sessions and tables in folders, and those that are named.
+def contents_of(places: Iterable[Path], without: Path) -> tuple[list[Found], list[Path]]:
+    """List the sessions in folders, and those that are named, in order of name; and tables that may be of sweeps.
 
     Parameters
     ----------
@@ -70,7 +62,7 @@ def contents_of(places: Iterable[Path], without: Path) -> Contents:
             marked.append(marks[notes])
         signature = hashlib.sha256("\n".join(marked).encode(errors="surrogateescape")).hexdigest()[:32]
         found.append(Found(path, files, signature))
-    return Contents(found, sorted(tables))
+    return found, sorted(tables)
 
 
 def _file_versions(place: Path) -> Mapping[Path, str]:

@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.archive.catalog import catalog_file  # first: it says which extra is missing
-from flowrec.archive.catalog.format import NAME, PLACE, SIGNATURE, About, path_of, path_text
-from flowrec.archive.catalog.places import Contents, Found, contents_of
-from flowrec.archive.catalog.session_rows import row_of
+from flowrec.archive.catalog.format import EVENTS, NAME, PLACE, SIGNATURE, About, path_of, path_text
+from flowrec.archive.catalog.places import Found, contents_of
 from flowrec.archive.catalog.sweeps import lists_of, sweep_rows
-from flowrec.core import Ended, SessionError, UsageError, __version__, printable
-from flowrec.store import UrlPath, session_path
-from flowrec.verbs import read_each
+from flowrec.archive.sweep.tasks import content_of
+from flowrec.core import Ended, FlowrecError, SessionError, UsageError, __version__, printable, seconds
+from flowrec.store import RefusedError, Session, TransientError, UrlPath, session_path
+from flowrec.verbs import TEXT_LIMIT, columns_of, describe, read_each
 
 _BROKEN = ("unreadable", "unfinished", "recording")
+_TEMPORARY = (OSError, TransientError, RefusedError)  # errors of a disk, a network or a server
+_EVENTS_LIMIT = 10_000  # of a session; no person makes more
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,19 +103,20 @@ def refresh(
         if not given and known.about is not None:
             given = [path_of(text, base) for text in known.about.places]
         given = given or [base if out is None else Path()]
-        contents = contents_of(given, path)
-        _refuse_if_emptied(given, contents, known, base)
-        named = {path_text(found.path, base): found for found in contents.sessions}
+        found, tables = contents_of(given, path)
+        if not found:
+            raise _emptied(given, len(known.sessions))
+        named = {path_text(each.path, base): each for each in found}
         places_before = map(os.fsdecode, known.sessions[PLACE].to_pylist())
         before = dict(zip(places_before, known.sessions[SIGNATURE].to_pylist(), strict=True))
-        due = {text: found for text, found in named.items() if before.get(text) != found.signature}
+        due = {text: each for text, each in named.items() if before.get(text) != each.signature}
         rows, stop_status = _read(due, progress)
         left = len(due) - len(rows)
         read = {os.fsdecode(row[PLACE]) for row in rows}
         # A changed session that was not read before an interruption is left out: what is known of it is out of date.
         kept = [text in named and text not in due for text in before]
         sessions = catalog_file.join_rows(known.sessions, kept, rows)
-        replays = sweep_rows(contents.tables, lambda table: printable(path_text(table, base)), remarks.append)
+        replays = sweep_rows(tables, lambda table: printable(path_text(table, base)), remarks.append)
         lists, verdicts = lists_of(sessions["content"].to_pylist(), replays)
         made = datetime.now(UTC).isoformat(timespec="seconds")
         stated = [path_text(place, base) for place in given]
@@ -140,17 +143,15 @@ def _default(places: Sequence[Path]) -> Path:
     return first / NAME if first is not None and not isinstance(first, UrlPath) and first.is_dir() else Path(NAME)
 
 
-def _refuse_if_emptied(places: Sequence[Path], contents: Contents, known: catalog_file.Known, base: Path) -> None:
-    """Refuse places without a session: a disk that is not mounted must not empty the catalog."""
-    if contents.sessions:
-        return
+def _emptied(places: Sequence[Path], known: int) -> SessionError | UsageError:
+    """The refusal of places without a session: a disk that is not mounted must not empty the catalog."""
     where = ", ".join(map(str, places))
-    if len(known.sessions):
-        raise SessionError(
-            f"{where}: holds no session any more, {len(known.sessions)} were there; is the disk mounted? The catalog "
+    if known:
+        return SessionError(
+            f"{where}: holds no session any more, {known} were there; is the disk mounted? The catalog "
             "stays as it is; remove it if they are gone for good"
         )
-    raise UsageError(f"{where}: no session (.mcap) is there, nor in a folder below; name directories and sessions")
+    return UsageError(f"{where}: no session (.mcap) is there, nor in a folder below; name directories and sessions")
 
 
 def _read(due: dict[str, Found], progress: Callable[[float], None]) -> tuple[list[dict[str, Any]], int]:
@@ -168,6 +169,44 @@ def _read(due: dict[str, Found], progress: Callable[[float], None]) -> tuple[lis
             raise
         stop_status = Ended.of(error).status
     return rows, stop_status
+
+
+def row_of(found: Found, path: str) -> dict[str, Any]:
+    """Values by column. A session that can not be opened is a row, too, with the reason as its note.
+
+    Parameters
+    ----------
+    path : as the catalog states it.
+    """
+    try:
+        listed, opened = describe(found.path, found.files, found.path.name)
+    except OSError as error:  # it went away meanwhile
+        reason = SessionError(f"{found.path}: can not be read ({error.strerror or error})")
+        unread = {"path": printable(path), "name": printable(found.path.name), "outcome": "unreadable"}
+        return unread | {"note": str(reason), SIGNATURE: "", PLACE: os.fsencode(path)}
+    row = columns_of(listed, printable(path)) | {EVENTS: [], "content": None, SIGNATURE: found.signature}
+    row[PLACE] = os.fsencode(path)
+    if isinstance(opened, SessionError):
+        # Without a signature the next refresh reads the file again: the error may pass without a change of the file.
+        temporary = listed.outcome == "recording" or isinstance(opened.__cause__, _TEMPORARY)
+        return row | ({SIGNATURE: ""} if temporary else {})
+    try:
+        row["content"] = content_of(opened)
+        if listed.facts.get("operator_events"):
+            row[EVENTS] = _events(opened)
+    except FlowrecError as error:  # its messages are damaged; what its head says is known
+        row["note"] = printable(f"{row['note']} {error}".strip())
+    finally:
+        opened.close()
+    return row
+
+
+def _events(session: Session) -> list[dict[str, Any]]:
+    """Operator events with their times; no other message is read."""
+    return [
+        {"time_s": seconds(each.stamp_ns), "action": each.action, "text": printable(each.text[:TEXT_LIMIT])}
+        for each, _ in zip(session.messages("operator"), range(_EVENTS_LIMIT), strict=False)
+    ]
 
 
 def _count_text(number: int) -> str:

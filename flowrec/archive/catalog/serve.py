@@ -7,26 +7,36 @@ removed when a later call serves others: the folder holds what was served last.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import signal
+import threading
 from pathlib import Path
 
 from flowrec.archive.catalog.find import find
 from flowrec.archive.catalog.format import PLACE, path_of
-from flowrec.core import RRD, FlowrecError, Output, SessionError, UsageError
+from flowrec.core import RRD, FlowrecError, Output, SessionError, UsageError, say
 from flowrec.exports import RrdExport
 from flowrec.store import Session, input_blamed
-from flowrec.view import is_made_from
+from flowrec.view import DATASET, is_made_from, serve_recordings
 
 FOLDER = ".flowrec-rrd"
 SERVED_LIMIT = 50  # sessions; each takes seconds to convert, and twice its size
 
 
-def recordings_of(catalog: Path, where: str, say: Callable[[str], None]) -> list[Path]:
-    """The .rrd files of the sessions that a condition finds, made where they are not there yet.
+def serve(catalog: Path, where: str, port: int | None) -> None:
+    """Serve the sessions of a catalog until Ctrl-C or a signal to end; parameters and errors as of `recordings_of`."""
+    recordings = recordings_of(catalog, where)
+    with serve_recordings(recordings, port) as url:
+        ended = threading.Event()
+        before = {each: signal.signal(each, lambda *_: ended.set()) for each in (signal.SIGINT, signal.SIGTERM)}
+        say(f"{url}: dataset {DATASET} of {len(recordings)}; open it with: rerun {url}")
+        say("Ctrl-C ends the server")
+        ended.wait()
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
-    Parameters
-    ----------
-    say : takes lines about sessions that can not be shown.
+
+def recordings_of(catalog: Path, where: str) -> list[Path]:
+    """The .rrd files of the sessions that a condition finds, made where they are not there yet.
 
     Raises
     ------
@@ -47,16 +57,18 @@ def recordings_of(catalog: Path, where: str, say: Callable[[str], None]) -> list
     made: list[Path] = []
     for path in found:
         try:
-            made.append(_rrd_of(Session(path_of(path, catalog.parent)), folder, say))
+            made.append(_rrd_of(Session(path_of(path, catalog.parent)), folder))
         except FlowrecError as error:
             say(f"{error}; it is not served")
     if not made:
         raise SessionError(f"none of {len(found)} sessions can be shown by Rerun")
-    _remove_others(folder, made)
+    for path in folder.glob(f"*{RRD[0]}"):
+        if path not in made:
+            path.unlink(missing_ok=True)
     return made
 
 
-def _rrd_of(session: Session, folder: Path, say: Callable[[str], None]) -> Path:
+def _rrd_of(session: Session, folder: Path) -> Path:
     """The .rrd of a session: an earlier one of the same session, or a new one."""
     path = folder / f"{session.path.stem}-{session.key[:8]}{RRD[0]}"
     if not is_made_from(path, session.key):
@@ -65,9 +77,3 @@ def _rrd_of(session: Session, folder: Path, say: Callable[[str], None]) -> Path:
             RrdExport().write(session, part, lambda _: None)
     session.close()
     return path
-
-
-def _remove_others(folder: Path, kept: Sequence[Path]) -> None:
-    for path in folder.glob(f"*{RRD[0]}"):
-        if path not in kept:
-            path.unlink(missing_ok=True)

@@ -16,11 +16,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flowrec.archive.sweep.ranking import RANKED_BY, settings_text
-from flowrec.archive.sweep.results import COLUMNS, is_sweep, rows_of
+from flowrec.archive.sweep.results import COLUMNS, array_of, is_sweep, rows_of
 from flowrec.core import FlowrecError, SessionError
 from flowrec.store import open_bytes
 
 _LIMIT_BYTES = 1 << 30
+_TEXTS = pa.list_(pa.string())
+_EMPTY = {"place": pa.int64(), "ticks": pa.int64(), "refinement": _TEXTS, "findings": _TEXTS}  # where all are unknown
 
 
 def sweep_rows(tables: Iterable[Path], named: Callable[[Path], str], remark: Callable[[str], None]) -> pa.Table:
@@ -43,7 +45,7 @@ def sweep_rows(tables: Iterable[Path], named: Callable[[Path], str], remark: Cal
             rows[row["key"]] = _flat(row) | {"table": named(path)}
     _rank(rows.values())
     names = dict.fromkeys(("settings", "place", "table", *COLUMNS, *(name for row in rows.values() for name in row)))
-    columns = {name: _array(name, [row.get(name) for row in rows.values()]) for name in names}
+    columns = {name: array_of([row.get(name) for row in rows.values()], _EMPTY.get(name)) for name in names}
     return pa.table(columns)
 
 
@@ -99,20 +101,6 @@ def _rank(rows: Iterable[dict[str, Any]]) -> None:
                 for place, row in enumerate(ranked, 1):
                     row["place"] = place
                 break
-
-
-def _array(name: str, values: Sequence[Any]) -> pa.Array:
-    """Values of one kind; of several tables, a column may be numbers in one and text in another."""
-    kinds = {type(value) for value in values if value is not None}
-    if name in ("place", "ticks") or kinds == {int}:
-        return pa.array(values, pa.int64())
-    if kinds == {list} or name in ("refinement", "findings"):
-        return pa.array([None if value is None else list(map(str, value)) for value in values], pa.list_(pa.string()))
-    if kinds <= {int, float} and kinds:
-        return pa.array(values, pa.float64())
-    if kinds == {bool}:
-        return pa.array(values, pa.bool_())
-    return pa.array([None if value is None else str(value) for value in values], pa.string())
 
 
 def _one(column: pa.ChunkedArray) -> pa.Array:

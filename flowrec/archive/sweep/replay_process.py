@@ -15,7 +15,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from flowrec.archive.sweep.tasks import Task, content_of
+from flowrec.archive.sweep.tasks import Task, change_of, content_of
 from flowrec.core import ChildProcess, FlowrecError, Parent, SessionError, forget_peak, peak_mb, printable
 
 Row = dict[str, Any]
@@ -176,7 +176,7 @@ def _figures(task: Task) -> Row:
     with Session(task.session) as session:
         if content_of(session) != task.content:
             raise SessionError(f"{task.session}: was changed while the sweep was under way; call it again")
-        done = replay_session(session, task.change)
+        done = replay_session(session, change_of(task.settings))
         rows = before_after(done) + (refly(done, None) if task.refly else [])
     return {
         "figures": {key: [was, now] for key, was, now in rows},

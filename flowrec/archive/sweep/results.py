@@ -222,7 +222,7 @@ def _table(rows: Sequence[Row]) -> pa.Table:
         judged = name in ("verdict", "findings")
         columns[name] = [(verdicts.get(row["content"], row) if judged else row).get(name) for row in rows]
     first = {name: columns[name] for name in _FIRST}
-    arrays = {name: _array(values) for name, values in (first | columns).items()}
+    arrays = {name: array_of(values) for name, values in (first | columns).items()}
     fields = [
         pa.field(name, array.type, metadata={"unit": unit_of(name), "meaning": COLUMNS.get(name, "")})
         for name, array in arrays.items()
@@ -231,13 +231,18 @@ def _table(rows: Sequence[Row]) -> pa.Table:
     return pa.Table.from_arrays(list(arrays.values()), schema=pa.schema(fields, metadata={_OURS: ours}))
 
 
-def _array(values: Sequence[Any]) -> pa.Array:
-    """Values of one kind; whole and broken numbers are float64, any other mixture is text."""
+def array_of(values: Sequence[Any], empty: pa.DataType | None = None) -> pa.Array:
+    """Values of one kind; whole and broken numbers are float64, any other mixture is text.
+
+    Parameters
+    ----------
+    empty : type of values that are all unknown; None: text.
+    """
     kinds = {type(value) for value in values if value is not None}
     if kinds == {int, float}:
         return pa.array(values, pa.float64())
     if kinds == {list}:
-        return pa.array(values, pa.list_(pa.string()))
+        return pa.array([value and list(map(str, value)) for value in values], pa.list_(pa.string()))
     if len(kinds) > 1:
         return pa.array([None if value is None else str(value) for value in values], pa.string())
-    return pa.array(values, None if kinds else pa.string())
+    return pa.array(values, None if kinds else empty or pa.string())

@@ -65,11 +65,6 @@ class Task:
         known += [self.packages] if self.packages else []
         return hashlib.sha256(json.dumps(known).encode()).hexdigest()[:32]
 
-    @property
-    def change(self) -> Change:
-        """The settings as `flowrec replay` takes them."""
-        return change_of(self.settings)
-
 
 def change_of(settings: Settings) -> Change:
     """Settings as `flowrec replay` takes them: the names of methods are its options, all else its --set."""

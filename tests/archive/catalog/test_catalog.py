@@ -18,8 +18,8 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
-from flowrec.archive import find_verb
-from flowrec.archive.catalog import catalog_file, refresh, session_rows
+from flowrec.archive import verbs
+from flowrec.archive.catalog import catalog_file, refresh
 from flowrec.archive.catalog.find import find, open_catalog
 from flowrec.archive.catalog.format import KEY, NAME
 from flowrec.archive.sweep.results import Results
@@ -173,7 +173,7 @@ def test_marks_are_read_from_the_chunks_that_hold_them(catalogued: Path, monkeyp
     def refuse(*_: object) -> None:
         raise AssertionError("a session without events is opened by its head and index only")
 
-    monkeypatch.setattr(session_rows, "_events", refuse)
+    monkeypatch.setattr(refresh, "_events", refuse)
     made_up(catalogued / "new.mcap", 9)
     assert refresh.refresh([catalogued]).new == 1
 
@@ -245,7 +245,7 @@ def test_the_catalog_moves_with_its_folder(catalogued: Path, monkeypatch: pytest
 def test_an_interrupted_catalog_keeps_what_it_has_read_and_goes_on(
     lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    genuine, read = session_rows.row_of, []
+    genuine, read = refresh.row_of, []
 
     def interrupted(found: Any, path: str) -> dict[str, Any]:
         read.append(path)
@@ -430,7 +430,7 @@ def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(
     assert (found["of"], found["sessions"][0]["seed"], found["sessions"][0]["path"]) == (7, 2, "may/b.mcap")
     assert typed("find", "seed = 77").exit_code == 0
     assert "unreadable" in typed("find", "outcome = 'unreadable'").stdout
-    monkeypatch.setattr(find_verb, "_SHOWN_ROWS", 3)
+    monkeypatch.setattr(verbs, "_SHOWN_ROWS", 3)
     assert typed("find").stdout.count(".mcap") == 3 and "7 of 7 sessions" in typed("find").stdout
     assert typed("find", "--limit", 5).stdout.count(".mcap") == 5
     assert len(json.loads(typed("find", "--json").stdout)["sessions"]) == 7

@@ -65,12 +65,13 @@ def test_recordings_are_made_once_and_those_of_others_are_removed(
         shutil.copy(GOLDEN, tmp_path / name)
     catalog = refresh([tmp_path]).path
     said: list[str] = []
-    (first,) = recordings_of(catalog, "name = 'a.mcap'", said.append)
-    assert recordings_of(catalog, "name = 'a.mcap'", said.append) == [first] and made == ["a.mcap"]
+    monkeypatch.setattr("flowrec.archive.catalog.serve.say", said.append)
+    (first,) = recordings_of(catalog, "name = 'a.mcap'")
+    assert recordings_of(catalog, "name = 'a.mcap'") == [first] and made == ["a.mcap"]
     assert str(first) in said[0]
-    (second,) = recordings_of(catalog, "name = 'b.mcap'", said.append)
+    (second,) = recordings_of(catalog, "name = 'b.mcap'")
     assert list((tmp_path / FOLDER).iterdir()) == [second] and refresh([tmp_path]).sessions == 2
     for where in ("name = 'none'", "true"):
         monkeypatch.setattr("flowrec.archive.catalog.serve.SERVED_LIMIT", 1)
         with pytest.raises(UsageError, match="choose them"):
-            recordings_of(catalog, where, said.append)
+            recordings_of(catalog, where)
