@@ -10,12 +10,12 @@ from .store.session import open as open
 from .verbs.check import check as check
 from .verbs.compare import compare as compare
 from .verbs.export import export as export
-from .verbs.record import import_movie as import_movie
+from .verbs.import_movie import import_movie as import_movie
 from .verbs.info import info as info
 from .verbs.record import record as record
 from .verbs.replay import replay as replay
 from .verbs.replay_change import Change as Change
 from .verbs.replay_made import Replay as Replay
-from .verbs.export import report as report
+from .verbs.report import report as report
 from .verbs.user_flow import refine as refine
 from .verbs.user_flow import solve as solve

@@ -31,6 +31,9 @@ from flowrec.core.units import seconds
 Result = TypeVar("Result")
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
 # The annotation is the wire form: a `vector` becomes a repeated double that viewers can plot,
 # an `array` keeps its shape and its bytes.
 Vector = Annotated[NDArray[np.float64], "vector"]

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Image
+from flowrec.core import Floats, Image
 
-Floats = NDArray[np.float64]
 Levels = NDArray[np.float32]  # grey levels, or what is computed of them
 Mask = NDArray[np.bool_]
 Colours = NDArray[np.uint8]  # (h, w, 3), blue first

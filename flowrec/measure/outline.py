@@ -18,7 +18,8 @@ import numpy as np
 import scipy  # its ndimage and special load at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.measure.images import Floats, Levels, Mask, blur_image, draw_curves, fill_curves, gradient, shrink
+from flowrec.core import Floats
+from flowrec.measure.images import Levels, Mask, blur_image, draw_curves, fill_curves, gradient, shrink
 
 Walls = Literal["dark", "bright", "step"]
 Sizes = NDArray[np.int64]

@@ -20,8 +20,8 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import ChipError, Image
-from flowrec.measure.images import Floats, Levels, Mask, blur_image, draw_curves, shrink
+from flowrec.core import ChipError, Floats, Image
+from flowrec.measure.images import Levels, Mask, blur_image, draw_curves, shrink
 from flowrec.measure.outline import Outline, Walls, outline_of
 from flowrec.measure.wall_lines import divisions, otsu
 from flowrec.physics import MAX_PIXELS, border, find_openings

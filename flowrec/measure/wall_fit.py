@@ -32,7 +32,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.measure.images import Floats, Levels, blur_image, gradient, shrink
+from flowrec.core import Floats
+from flowrec.measure.images import Levels, blur_image, gradient, shrink
 from flowrec.measure.wall_search import WallMap, move_chip
 from flowrec.physics import Calibration
 

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.measure.images import Floats, Levels, Mask, blur_image, slopes
+from flowrec.core import Floats
+from flowrec.measure.images import Levels, Mask, blur_image, slopes
 
 _SIGMAS_PX = ((1.2, 2.0), (2.0, 3.5), (3.5, 5.5))  # of lines; each row is a hypothesis
 _THRESHOLDS = (0.55, 0.9)  # of a wall, relative to Otsu's threshold between strong and weak ridges

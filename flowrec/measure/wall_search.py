@@ -19,8 +19,8 @@ import numpy as np
 import scipy  # its fft and optimize load at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import cells_at
-from flowrec.measure.images import Floats, Levels, Mask, blur_image, gradient, shrink
+from flowrec.core import Floats, cells_at
+from flowrec.measure.images import Levels, Mask, blur_image, gradient, shrink
 from flowrec.physics import Calibration, clearance_um
 
 Complex = NDArray[np.complex64]

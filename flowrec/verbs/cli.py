@@ -1,6 +1,6 @@
 """The command line: all verbs, the entry point, and its errors in one line.
 
-A verb is a function of its name, beside those of its kind; command.py makes its command.
+A verb is a function in a file of its name; command.py makes its command.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs, 130 stopped by Ctrl-C or a key, 143 by SIGTERM, 129 by a closed terminal.
@@ -21,14 +21,17 @@ import flowrec
 from flowrec.core import FlowrecError, StoppedError, UsageError, printable
 from flowrec.store import TIMEOUT_KEY, TRAFFIC
 from flowrec.verbs.calibrate import calibrate
-from flowrec.verbs.check import check, recover
+from flowrec.verbs.check import check
 from flowrec.verbs.command import add_verb, outside_verb
 from flowrec.verbs.compare import compare
 from flowrec.verbs.doctor import doctor
-from flowrec.verbs.export import export, report, view
-from flowrec.verbs.info import info, note
+from flowrec.verbs.export import export
+from flowrec.verbs.import_movie import import_movie
+from flowrec.verbs.info import info
 from flowrec.verbs.ls import ls
-from flowrec.verbs.methods import methods, new
+from flowrec.verbs.methods import methods
+from flowrec.verbs.new import new
+from flowrec.verbs.note import note
 from flowrec.verbs.options import (
     HELP_SETTINGS,
     OUR_VERBS,
@@ -36,8 +39,11 @@ from flowrec.verbs.options import (
     WholeDescriptions,
     from_above,
 )
-from flowrec.verbs.record import import_movie, record
+from flowrec.verbs.record import record
+from flowrec.verbs.recover import recover
 from flowrec.verbs.replay import DEFAULT_REFINE, replay
+from flowrec.verbs.report import report
+from flowrec.verbs.view import view
 
 
 class _Verbs(Stoppable, WholeDescriptions):

@@ -1,14 +1,13 @@
-"""A session in other files: `flowrec export` and `view`, and `report`, one page about it, or about a sweep."""
+"""`flowrec export`: write a session in another format."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from flowrec.core import FlowrecError, UsageError
+from flowrec.core import UsageError
 from flowrec.verbs.command import MethodsOf, Told, verb
-from flowrec.verbs.options import AnySession, Asked, Overwrite, SessionFile, from_above
+from flowrec.verbs.options import AnySession, Asked, Overwrite, SessionFile
 
 
 def export_json(session: AnySession, made: Path, file_format: str = "rrd") -> dict[str, Any]:
@@ -69,118 +68,3 @@ def export(
     from flowrec.exports import export as write
 
     return write(session, out if out is not None else directory, overwrite, file_format, beside)
-
-
-@verb(
-    "flowrec view a.mcap",
-    "flowrec view a.mcap --screenshot a.png --time 12",
-    "flowrec view a.mcap --layout .",
-)
-def view(
-    session: Annotated[Path, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd).")],
-    beside: Annotated[
-        Path | None, typer.Argument(metavar="[OTHER]", help="Another session of the same chip, in the same view.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="File to write; by default beside the session, where it replaces an .rrd of that session.",
-        ),
-    ] = None,
-    screenshot: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Save a picture of the viewer instead of opening it.")
-    ] = None,
-    time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
-    layout: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Write layouts into this folder by which Foxglove (.json) and Rerun (.rbl) show the .mcap itself.",
-        ),
-    ] = None,
-    no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
-    overwrite: Overwrite = False,
-) -> Told:
-    """Write the .rrd of a session and open it in Rerun.
-
-    Raises
-    ------
-    UsageError : outputs that do not go together.
-    SessionError : the session can not be read, or an output not be written; OutputError if it may not be.
-    """
-    from flowrec.core import PICTURE, Output
-    from flowrec.store import files_behind
-    from flowrec.view import open_viewer
-    from flowrec.view import screenshot as take
-
-    if session.suffix == ".rrd" and not session.exists():
-        raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
-    if beside is not None and ".rrd" in (session.suffix, beside.suffix):
-        raise UsageError(f"{session} and {beside}: two sessions (.mcap) are shown in one view, not .rrd files")
-    if layout is not None:
-        if session.suffix == ".rrd" or any(value is not None for value in (beside, out, screenshot, time)):
-            raise UsageError(f"--layout {layout}: is for one session (.mcap) and goes with no other output")
-        from flowrec.exports import write_layouts
-
-        made = write_layouts(session, layout, overwrite)
-        found = {"session": session, "foxglove": made.foxglove, "rerun": made.rerun}
-        return Told(lambda: {key: str(path) for key, path in found.items()}, remarks=lambda: made.advice)
-    if screenshot is not None:
-        Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
-    rrd = session if session.suffix == ".rrd" else export(session, out, overwrite, beside=beside)
-    told: list[str] = []
-    if screenshot is not None:
-        told += [*take(rrd, screenshot, time_s=time, overwrite=overwrite), f"{screenshot} written"]
-    elif not no_open:
-        told += filter(None, [open_viewer(rrd)])
-    return Told(lambda: export_json(session, rrd), remarks=lambda: told)
-
-
-def _report_told(asked: Asked, page: Path) -> Told:
-    figures = {"figures": str(asked["figures"])} if asked["figures"] is not None else {}
-    return Told(lambda: {"session": str(asked["session"]), "html": str(page), "bytes": page.stat().st_size} | figures)
-
-
-@verb(
-    "flowrec report a.mcap",
-    "flowrec report a.mcap a_replay_001.mcap -o report.html --figures figures",
-    "flowrec report sweep.parquet -o sweep.html",
-    result=_report_told,
-)
-def report(
-    session: SessionFile,
-    replays: Annotated[
-        list[Path] | Sequence[AnySession] | None,
-        typer.Argument(metavar="[REPLAY]...", help="Replays of it (.mcap), compared with it."),
-    ] = None,
-    out: Annotated[
-        Path | str | None, typer.Option("--out", "-o", help="Page to write (.html); SESSION_report.html by default.")
-    ] = None,
-    figures: Annotated[
-        Path | str | None, typer.Option(metavar="DIR", help="Write the figures, too, as SVG and PDF of 88 and 180 mm.")
-    ] = None,
-    overwrite: Overwrite = False,
-) -> Path:
-    """Write one page (HTML) about a session, to read, print or send: outcome, path, flow before and after, losses.
-
-    Of a table of flowrec sweep (.parquet): the ranking of its settings.
-
-    Returns
-    -------
-    The path of the page, which needs no network and no script.
-
-    Raises
-    ------
-    UsageError : a package of the extra `report` is not installed, or a replay is not one of this session.
-    SessionError : a session can not be read, or an output not be written; OutputError if it may not be.
-    """
-    if isinstance(session, Path | str) and Path(session).suffix == ".parquet":
-        if replays or figures is not None:
-            raise UsageError(f"{session}: the page of a sweep goes without replays and --figures")
-        page: Path = from_above("report_sweep")(Path(session), None if out is None else Path(out), overwrite)
-        return page
-    from flowrec.verbs.report_page import write_report
-
-    return write_report(session, replays or (), out, figures, overwrite)

@@ -1,4 +1,4 @@
-"""`flowrec info`: facts about a session, from its head and index only; `flowrec note`: add to them, or print them.
+"""`flowrec info`: facts about a session, from its head and index only.
 
 The configuration is read as plain TOML, and topics by their names in the file: importing stages and messages takes
 long.
@@ -7,18 +7,15 @@ long.
 import json
 import struct
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from flowrec.core import name_of, of_text, outside_facts, seconds, text_of_figure
 from flowrec.verbs.command import verb
 from flowrec.verbs.options import SessionFile
 
 if TYPE_CHECKING:
-    from flowrec.store import Note, Part, Run
+    from flowrec.store import Part, Run
 
 
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
@@ -197,45 +194,3 @@ def _in_brackets(text: str) -> str:
 def _why(outcome: Mapping[str, str]) -> str:
     """The note of an outcome or, of a failed run, its reason."""
     return outcome.get("note") or outcome.get("reason", "")
-
-
-class Notes(tuple["Note", ...]):
-    """All notes of a session, in the order in which they were added; `added`: one was added just now."""
-
-    path: Path
-    added: bool
-
-    def as_json(self) -> dict[str, Any]:
-        """For JSON."""
-        return {"session": str(self.path), "notes": [asdict(each) for each in self]}
-
-    def lines(self) -> list[str]:
-        """A line for each note; none if one was added."""
-        return [] if self.added else [_note_line(each) for each in self]
-
-
-@verb('flowrec note a.mcap "bubble at the outlet" --tag bubble', "flowrec note a.mcap")
-def note(
-    session: SessionFile,
-    text: Annotated[str, typer.Argument(metavar="[TEXT]", help="The note; without one, notes are printed.")] = "",
-    tags: Annotated[list[str] | None, typer.Option("--tag", metavar="WORD", help="Add a tag; may be repeated.")] = None,
-) -> Notes:
-    """Add a note or tags to a recorded session, in a file beside it, or print them.
-
-    Raises
-    ------
-    SessionError : there is no session, or no note can be written beside it.
-    """
-    from flowrec.store import Session
-
-    session = Session.of(session)
-    if text or tags:
-        session.add_note(text, tags or [])
-    notes = Notes(session.notes)
-    notes.path, notes.added = session.path, bool(text or tags)
-    return notes
-
-
-def _note_line(note: "Note") -> str:
-    words = " ".join([*(f"#{tag}" for tag in note.tags), note.text])
-    return f"{note.written[:16].replace('T', ' ')} {note.author}: {words}"

@@ -62,9 +62,9 @@ def recordings_of(catalog: Path, where: str) -> list[Path]:
             say(f"{error}; it is not served")
     if not made:
         raise SessionError(f"none of {len(found)} sessions can be shown by Rerun")
-    for path in folder.glob(f"*{RRD[0]}"):
-        if path not in made:
-            path.unlink(missing_ok=True)
+    for other in folder.glob(f"*{RRD[0]}"):
+        if other not in made:
+            other.unlink(missing_ok=True)
     return made
 
 

@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flowrec.core import Range, Seed
-from flowrec.physics.arrays import Bools, Floats
+from flowrec.core import Bools, Floats, Range, Seed
 from flowrec.physics.chip.fluid import ViscosityLaw, ViscositySettings
 
 Side = Literal["left", "right", "top", "bottom"]

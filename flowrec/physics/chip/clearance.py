@@ -9,8 +9,7 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import ChipError
-from flowrec.physics.arrays import Bools, Floats
+from flowrec.core import Bools, ChipError, Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.openings import border, named_opening
 

@@ -23,8 +23,7 @@ from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
 
-from flowrec.core import ChipError, Method, Methods, Range, faults
-from flowrec.physics.arrays import Floats
+from flowrec.core import ChipError, Floats, Method, Methods, Range, faults
 
 LEAST_EXPONENT = 0.05  # that an unknown exponent can reach
 RATES_1_S = tuple(float(rate) for rate in np.logspace(-4, 6, 121).round(10))  # at which a user's function is read

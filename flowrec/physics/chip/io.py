@@ -38,8 +38,7 @@ import cv2
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 
-from flowrec.core import ChipError, hints, parse_toml, refuse_irregular
-from flowrec.physics.arrays import Bools
+from flowrec.core import Bools, ChipError, hints, parse_toml, refuse_irregular
 from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings, Kind, Opening, Side, Walls
 from flowrec.physics.chip.fluid import (
     BLOOD_KG_M3,

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import ChipError
-from flowrec.physics.arrays import Bools, Floats
+from flowrec.core import Bools, ChipError, Floats
 from flowrec.physics.chip.chip import Chip, Kind, Opening, Side
 
 SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flowrec.physics.arrays import Floats
+from flowrec.core import Floats
 from flowrec.physics.chip.registration import Calibration
 
 _NAMES = {

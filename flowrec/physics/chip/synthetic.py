@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from flowrec.core import ChipError
-from flowrec.physics.arrays import Bools, Floats
+from flowrec.core import Bools, ChipError, Floats
 from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip
 from flowrec.physics.chip.openings import find_openings, guess_inlets, set_inlet_speed
 

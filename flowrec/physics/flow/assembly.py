@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from flowrec.physics.arrays import Floats, Ints
+from flowrec.core import Floats, Ints
 
 
 @dataclass(slots=True)

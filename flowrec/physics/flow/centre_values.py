@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, Ints
 from flowrec.physics.flow.assembly import Triplets
 from flowrec.physics.flow.grid import WALL, Faces, Grid, number_where
 from flowrec.physics.flow.wall_stencils import Profiles

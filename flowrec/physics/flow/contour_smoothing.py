@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, Ints
 
 STIFFNESS_PX = 8.0  # l of a wall that stays in its gates: wobbles shorter than about 2 pi l come from the mask's steps
 SOFTENING = 16.0  # divides l^6 around gates that the curve misses

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from flowrec.core import M_PER_UM
-from flowrec.physics.arrays import Floats
+from flowrec.core import M_PER_UM, Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.fluid import ViscosityLaw
 from flowrec.physics.flow import stress as stresses

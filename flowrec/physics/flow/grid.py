@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowError
-from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, FlowError, Ints
 from flowrec.physics.chip.chip import Chip, Kind, Opening, Side
 from flowrec.physics.chip.openings import SIDES, border
 from flowrec.physics.flow.assembly import components

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, Ints
 from flowrec.physics.chip.chip import Walls
 from flowrec.physics.flow.contour_smoothing import contour_segments
 

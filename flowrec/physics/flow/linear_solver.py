@@ -30,8 +30,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-from flowrec.core import separate_large_blocks
-from flowrec.physics.arrays import Floats
+from flowrec.core import Floats, separate_large_blocks
 from flowrec.physics.chip.chip import Chip
 
 # An assimilation on a network holds 0.45 GB, a bifurcation 0.27 GB (five depths, k = 1).

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, Ints
 from flowrec.physics.flow.assembly import Triplets, per_flux
 from flowrec.physics.flow.centre_values import centre_operator
 from flowrec.physics.flow.grid import INLET, OPEN, OUTLET, WALL, Faces, Grid

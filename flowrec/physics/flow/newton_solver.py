@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from flowrec.core import M_PER_UM, PA_S_PER_MPA_S
-from flowrec.physics.arrays import Floats
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, Floats
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.flow import grid as grids
 from flowrec.physics.flow import momentum as momenta

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import FlowError, FlowField
-from flowrec.physics.arrays import Bools, Floats
+from flowrec.core import Bools, Floats, FlowError, FlowField
 from flowrec.physics.flow.velocity_stencil import velocities_at, velocity_at
 
 _NO_WALLS = np.zeros((0, 0), np.float32)

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import UM_PER_M
-from flowrec.physics.arrays import Floats
+from flowrec.core import UM_PER_M, Floats
 from flowrec.physics.flow.assembly import averages
 from flowrec.physics.flow.generalised import GeneralisedSystem
 from flowrec.physics.flow.grid import Grid, GridOpening, number_where

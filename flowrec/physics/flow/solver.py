@@ -7,8 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import UM_PER_M, FlowError, FlowField, OneOf, Range
-from flowrec.physics.arrays import Floats
+from flowrec.core import UM_PER_M, Floats, FlowError, FlowField, OneOf, Range
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.fluid import law_text
 from flowrec.physics.flow.generalised import GeneralisedSystem, generalised_system

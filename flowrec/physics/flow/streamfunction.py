@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.core import FlowError
-from flowrec.physics.arrays import Floats, Ints
+from flowrec.core import Floats, FlowError, Ints
 from flowrec.physics.flow.assembly import Triplets, components
 from flowrec.physics.flow.grid import WALL, Grid, number_where
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, Ints
 from flowrec.physics.flow.assembly import Triplets, averages, per_flux, scaled_rows
 from flowrec.physics.flow.grid import INLET, OUTLET, WALL, Faces, Grid
 from flowrec.physics.flow.level_set import LevelSet

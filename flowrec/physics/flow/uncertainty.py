@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.physics.arrays import Floats
+from flowrec.core import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.physics.arrays import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, Ints
 from flowrec.physics.flow.grid import OPEN, OUTLET, WALL, Faces, number_where
 from flowrec.physics.flow.level_set import LevelSet
 

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import compiled
+from flowrec.core import Floats, compiled
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Points = Floats  # (n, 2), or (2,) of one
 Raster = Floats  # (h, w)

@@ -13,9 +13,9 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import FlowError, FlowField, Range, UsageError
+from flowrec.core import Floats, FlowError, FlowField, Range, UsageError
 from flowrec.physics import COURSE, Chip, Robot, clearance_um
-from flowrec.stages.planning.cost_rasters import CostRasters, Floats, Mask, Raster
+from flowrec.stages.planning.cost_rasters import CostRasters, Mask, Raster
 
 _LEAST_SPEED_RATIO = 0.02  # of the robot's speed, left where the flow may be wrong by more than that speed
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from flowrec.core import bilinear, compiled, corner_weights
-from flowrec.stages.planning.cost_rasters import Floats, Raster
+from flowrec.core import Floats, bilinear, compiled, corner_weights
+from flowrec.stages.planning.cost_rasters import Raster
 
 
 @compiled

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import FlowField, Route, UsageError
+from flowrec.core import Floats, FlowField, Route, UsageError
 from flowrec.physics import Robot, sample
-from flowrec.stages.planning.cost_rasters import Floats, Points
+from flowrec.stages.planning.cost_rasters import Points
 
 _STEPS_PER_PX = 4.0
 

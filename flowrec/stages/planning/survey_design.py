@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowField, Observations, Route, nearest_pixels
+from flowrec.core import Floats, FlowField, Observations, Route, nearest_pixels
 from flowrec.physics import Chip, FlowUncertainty, Robot
-from flowrec.stages.planning.cost_rasters import Floats
 
 
 @dataclass(frozen=True, slots=True)

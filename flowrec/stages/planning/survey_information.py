@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import FlowField, Route
+from flowrec.core import Floats, FlowField, Route
 from flowrec.physics import FlowUncertainty, fluid_image
-from flowrec.stages.planning.cost_rasters import Floats, Mask, Points, Raster
+from flowrec.stages.planning.cost_rasters import Mask, Points, Raster
 from flowrec.stages.planning.free_space import FreeSpace
 from flowrec.stages.planning.grid_search import backtrack
 from flowrec.stages.planning.problem import Endpoint, attach_goal, attach_start

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import Route
-from flowrec.stages.planning.cost_rasters import Floats
+from flowrec.core import Floats, Route
 
 MOST_PLACES = 500  # of a map of which the move is taken; it is as smooth as the modes of the flow
 _STATED, _EXPECTED, _MOVED, _PROGRESS, _END = range(5)  # columns of `Route.stretches`

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import Route, bilinear
+from flowrec.core import Floats, Route, bilinear
 from flowrec.physics import RESERVE
-from flowrec.stages.planning.cost_rasters import Floats, interpolate_raster
+from flowrec.stages.planning.cost_rasters import interpolate_raster
 from flowrec.stages.planning.eikonal import descend, time_field
 from flowrec.stages.planning.grid_search import TRAVEL_TIME, directions, shortest_path, too_fast_route
 from flowrec.stages.planning.path_refinement import SPACING_PX, refined_route

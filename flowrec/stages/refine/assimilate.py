@@ -16,7 +16,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import FlowError, FlowField, Range
+from flowrec.core import Floats, FlowError, FlowField, Range
 from flowrec.physics import Chip, FlowSolver, fluid_image, law_text, median_width_um
 from flowrec.stages.refine.causes import AS_STATED, Observed
 from flowrec.stages.refine.discretisation_error import ModelError
@@ -41,7 +41,7 @@ from flowrec.stages.refine.hypothesis import (
 )
 from flowrec.stages.refine.mask_variants import mask_variants
 from flowrec.stages.refine.method import RefinementProblem
-from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.obstacles import PLACES, Obstacle, likely_obstacles, with_shape_error
 from flowrec.stages.refine.prior import PriorSettings
 from flowrec.stages.refine.report import over_error, report

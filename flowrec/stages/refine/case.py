@@ -13,10 +13,10 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, FlowField
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, Floats, FlowField
 from flowrec.physics import Chip, Opening, border
 from flowrec.stages.refine.local_viscosity import LocalViscosity, viscosity_scale
-from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import ObservationOperator
 
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)
 MULTIPLE = 16  # a U-Net of four levels needs sides that are multiples of this

@@ -30,12 +30,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import cells_at
+from flowrec.core import Floats, cells_at
 from flowrec.physics import clearance_um
 from flowrec.stages.refine.channel_cells import curvature
 from flowrec.stages.refine.evidence import Effect
 from flowrec.stages.refine.flow_model import FlowModel
-from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.sphere_between_walls import SphereBetweenWalls
 
 # Median and ln_std of the size of each effect.

@@ -17,8 +17,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from flowrec.core import Floats
 from flowrec.physics import Chip, Sensitivities, clearance_um, compute_cached, median_width_um
-from flowrec.stages.refine.observation_operator import Floats
 
 LENGTH_WIDTHS = 2.0  # reach of a cell in median channel widths: an error of a wall or of a depth is longer than wide
 MOST = 40  # cells of a chip; in a larger one they are longer. Each costs one solution with the factors of the flow

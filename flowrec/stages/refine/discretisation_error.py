@@ -14,9 +14,8 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import FlowError, Range
+from flowrec.core import Floats, FlowError, Range
 from flowrec.physics import Chip, FlowSolver, Sensitivities, fluid_image
-from flowrec.stages.refine.observation_operator import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

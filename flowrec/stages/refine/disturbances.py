@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from flowrec.core import Floats
 from flowrec.stages.refine.evidence import EffectModel, Sizes, gains_of_trials
-from flowrec.stages.refine.observation_operator import Disturbance, Floats
+from flowrec.stages.refine.observation_operator import Disturbance
 
 SHAKE = "shake"
 HELD_BACK = "held back"

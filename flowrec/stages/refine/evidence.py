@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # its linalg and optimize load at first use, not at start-up
 
-from flowrec.stages.refine.observation_operator import Floats
+from flowrec.core import Floats
 
 POINTS = 32  # at which the posterior of the sizes is integrated; a power of two above the number of sizes
 NEGLIGIBLE = 1e-3  # weight of a point, relative to the largest, that is left out

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from flowrec.core import Floats
 from flowrec.stages.refine.causes import LOCAL, RESISTANCE, WALLS, WALLS_LONG
 from flowrec.stages.refine.channel_cells import steepness
 from flowrec.stages.refine.flow_model import FlowModel
 from flowrec.stages.refine.hypothesis import HypothesisFit
-from flowrec.stages.refine.observation_operator import Floats
 
 
 def field_columns(found: HypothesisFit) -> Floats:

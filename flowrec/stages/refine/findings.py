@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import FlowField
+from flowrec.core import Floats, FlowField
 from flowrec.physics import Chip
 from flowrec.stages.refine.causes import LINE_NAME, WANDER_S
 from flowrec.stages.refine.disturbances import SHAKE
 from flowrec.stages.refine.hypothesis import HypothesisFit
-from flowrec.stages.refine.observation_operator import Floats
 from flowrec.stages.refine.obstacles import Obstacle
 
 SURE = 2.5  # standard deviations from zero above which a cause is named

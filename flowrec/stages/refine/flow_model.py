@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from flowrec.core import Floats
 from flowrec.physics import Chip, FlowSolver, Sensitivities, chip_key, compute_cached, median_width_um
 from flowrec.stages.refine.channel_cells import cell_widening, channel_cells, resistance_modes
 from flowrec.stages.refine.discretisation_error import ModelError
-from flowrec.stages.refine.observation_operator import Floats
 from flowrec.stages.refine.prior import Prior, PriorSettings, law_widths
 
 

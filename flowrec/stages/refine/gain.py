@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import FlowField
+from flowrec.core import Floats, FlowField
 from flowrec.stages.refine.held_back import Scores, blocks, made_after, predicted_in
 from flowrec.stages.refine.method import RefinementProblem
-from flowrec.stages.refine.observation_operator import Floats
 
 _FACTOR_STD = 1.0  # prior of the factor around 1: far wider than what any observation leaves
 _BISECTIONS = 40  # of ln s between 1e-4 and 1e4: to 1e-11 of their ratio

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 from scipy.sparse.linalg import splu
 
+from flowrec.core import Floats
 from flowrec.stages.refine.case import Case
-from flowrec.stages.refine.observation_operator import TAIL, Floats
+from flowrec.stages.refine.observation_operator import TAIL
 from flowrec.stages.refine.residuals import Physics
 
 Ints = NDArray[np.intp]

@@ -24,10 +24,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowField, seconds
+from flowrec.core import Floats, FlowField, seconds
 from flowrec.physics import on_chip
 from flowrec.stages.refine.hypothesis import HypothesisFit, averages, groups
-from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import ObservationOperator
 
 Indices = NDArray[np.intp]
 

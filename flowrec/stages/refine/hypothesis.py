@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.core import Floats
 from flowrec.physics import Registration, Remainder
 from flowrec.stages.refine.causes import CURVED, RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
 from flowrec.stages.refine.disturbances import likeliest_hz, shaking
 from flowrec.stages.refine.evidence import Effect, EffectModel, Posterior, Sizes, gains_of_trials
 from flowrec.stages.refine.mixture_regression import Model
-from flowrec.stages.refine.observation_operator import Disturbance, Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import Disturbance, ObservationOperator
 
 MOST_OBSERVATIONS = 120  # of which the evidence is computed: more are first averaged along the way
 LEAST_STD = 1e-3  # of the typical observed speed: no observation is more accurate

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowrec.core import Floats
 from flowrec.physics import Chip, ViscosityLaw
-from flowrec.stages.refine.observation_operator import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowError, Range, Seed, Threads, Weight
+from flowrec.core import Floats, FlowError, Range, Seed, Threads, Weight
 from flowrec.stages.refine.case import Case
-from flowrec.stages.refine.observation_operator import TAIL, Floats
+from flowrec.stages.refine.observation_operator import TAIL
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from flowrec.core import Floats
 from flowrec.stages.refine.case import Case
-from flowrec.stages.refine.observation_operator import Floats
 
 INPUTS = 12  # channels of `NetworkInputs.with_observations`
 GAIN, FREE, PRESSURE, LOG_STD = slice(0, 1), slice(1, 3), slice(3, 4), slice(4, 5)  # of a trained network's output

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Observations, cells_at, nearest_pixels
+from flowrec.core import Floats, Observations, cells_at, nearest_pixels
 from flowrec.physics import pixel_weights
 
-Floats = NDArray[np.float64]
 Disturbance = tuple[str, Floats]  # name, and (p, n, 2) what 1 um/s of each unknown adds to observations, whatever flows
 
 TAIL = 4.0  # degrees of freedom of the observations' Student-t noise

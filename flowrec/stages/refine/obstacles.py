@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy  # its linalg and ndimage load at first use, not at start-up
 
-from flowrec.core import UM_PER_M, NotFiniteError
+from flowrec.core import UM_PER_M, Floats, NotFiniteError
 from flowrec.physics import (
     Chip,
     FlowSolver,
@@ -37,7 +37,6 @@ from flowrec.physics import (
 from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.flow_model import FlowModel
 from flowrec.stages.refine.hypothesis import NOISE, HypothesisFit, Robust, of_the_field
-from flowrec.stages.refine.observation_operator import Floats
 
 RATIOS = (2.0, 4.0, 10.0, 40.0, 1000.0)  # resistance of a piece over that of a free one: half the width is 8
 DEPOSIT = 1.2  # reach of the deposits that are tried first

@@ -18,11 +18,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from flowrec.core import FlowField, Range
+from flowrec.core import Floats, FlowField, Range
 from flowrec.stages.refine.case import Case
 from flowrec.stages.refine.method import RefinementProblem
 from flowrec.stages.refine.network_fit import FieldLoss, NetworkFit, NetworkSettings, fit_network, torch_run
-from flowrec.stages.refine.observation_operator import Floats, student_t_loss
+from flowrec.stages.refine.observation_operator import student_t_loss
 from flowrec.stages.refine.weights import SHIPPED, read_weights, sha256
 
 HELD_OUT = 4  # every fourth observation tests whether a correction is an improvement

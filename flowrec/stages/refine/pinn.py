@@ -17,11 +17,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, FlowError, FlowField, NotFiniteError, Range, Seed, Threads, Weight
+from flowrec.core import (
+    M_PER_UM,
+    PA_S_PER_MPA_S,
+    Floats,
+    FlowError,
+    FlowField,
+    NotFiniteError,
+    Range,
+    Seed,
+    Threads,
+    Weight,
+)
 from flowrec.physics import Chip, border, median_width_um
 from flowrec.stages.refine.method import RefinementProblem
 from flowrec.stages.refine.network_fit import Device, Iterations, adam, torch_run
-from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import ObservationOperator
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -7,9 +7,8 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import FlowError, Range
+from flowrec.core import Floats, FlowError, Range
 from flowrec.physics import Chip
-from flowrec.stages.refine.observation_operator import Floats
 
 
 @dataclass(frozen=True, slots=True)

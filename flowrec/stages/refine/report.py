@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.core import Floats
 from flowrec.physics import Chip
 from flowrec.stages.refine.hypothesis import NOISE, HypothesisFit
-from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.prior import Prior
 
 UNOBSERVED = 0.9  # posterior over prior std above which an opening counts as not observed

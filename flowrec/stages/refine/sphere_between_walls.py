@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.stages.refine.observation_operator import Floats
+from flowrec.core import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import FlowError
+from flowrec.core import Floats, FlowError
 from flowrec.physics import Chip, FlowSolver, FlowUncertainty
 from flowrec.stages.refine.assimilate import OBSTACLE_SHARE, Assimilate, Hypotheses
 from flowrec.stages.refine.causes import GAIN
@@ -14,7 +14,7 @@ from flowrec.stages.refine.doubts import doubted_places
 from flowrec.stages.refine.field_variance import field_columns, left_variance, prior_left_variance, prior_of
 from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.hypothesis import NOISE
-from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.observation_operator import ObservationOperator
 
 
 def flow_uncertainty(

@@ -1,0 +1,102 @@
+"""`flowrec import`: a movie and a log of the coils become a session, as if the run had been recorded."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flowrec.verbs.command import Told, verb
+from flowrec.verbs.options import ATTENDED, AsConfig, Asked, Overwrite, Sets, readable_toml
+from flowrec.verbs.record import config_of_call
+
+if TYPE_CHECKING:
+    from flowrec.verbs.interactive import Unattended
+    from flowrec.verbs.run_summary import Recorded
+
+
+def _import_told(_asked: Asked, done: "Recorded") -> Told:
+    facts = {
+        **{"path": str(done.path), **done.facts, "files": [*map(str, done.files)]},
+        "alignment": json.loads(done.source.get("alignment", "null")),
+        "covered": done.covered.as_json() if done.covered is not None else None,
+    }
+    return Told.of(done)._replace(as_json=lambda: facts)
+
+
+@verb("flowrec import movie.avi lab.toml --coils coils.csv -o a.mcap", result=_import_told)
+def import_movie(
+    movie: Annotated[
+        Path | str,
+        typer.Argument(help="Movie: AVI, MP4, MKV, MOV, TIFF, ND2, OME-Zarr, or a folder of images."),
+    ],
+    out: Annotated[
+        Path | str | None, typer.Option("--out", "-o", help="Session file; by default named by date and sample.")
+    ] = None,
+    config: Annotated[AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML).")] = None,
+    *,
+    coils: Annotated[
+        Path | str | None,
+        typer.Option(metavar="LOG", help="What the coils did (CSV, Excel); columns: section movie.columns."),
+    ] = None,
+    times: Annotated[
+        Path | str | None, typer.Option(metavar="FRAMES.csv", help="Times of the images: columns frame, time_s.")
+    ] = None,
+    fps: Annotated[float | None, typer.Option(metavar="F", help="Images per second, where no times are known.")] = None,
+    partial: Annotated[bool, typer.Option("--partial", help="Take a movie that breaks off up to there.")] = False,
+    align: Annotated[
+        bool,
+        typer.Option("--align/--no-align", help="Fit the clock of the log to the motion of the robot."),
+    ] = True,
+    robot: Annotated[
+        str | int,
+        typer.Option(metavar="WHICH", help="Which body is the robot: number of the picture, X,Ypx, or X,Y in um."),
+    ] = "",
+    sets: Sets = None,
+    overwrite: Overwrite = False,
+    control: Annotated["Unattended | None", ATTENDED] = None,
+) -> "Recorded":
+    """Make a session of a movie and a log of the coils: track the robot, observe and refine the flow.
+
+    Parameters
+    ----------
+    control : as in `record`.
+
+    Returns
+    -------
+    The session and its figures. A failure leaves no file.
+
+    Notes
+    -----
+    The configuration must give camera.um_per_px, robot.radius_um and chip.path, which no file tells but one that
+    flowrec exported: such a movie, or else the folder of tables around `coils`, gives these and what else is known of
+    robot, camera and coils. It is used where a setting has its default value. Without a log of the coils, see
+    control/coil_log.py, only movie.drifts refines the flow. Without `align`, see verbs/align.py, offset and rate of the
+    log's clock are those of the settings movie.clock_offset_s and clock_rate.
+
+    Raises
+    ------
+    FlowrecError : in one line: what can not be read, what does not fit together, what is not told.
+    """
+    from flowrec.core import settings_of
+
+    given = {} if fps is None else {"movie.rate_hz": fps}
+    flags = dict.fromkeys(given, "--fps")
+    chosen, inputs = config_of_call(config, settings_of(sets or ()) | given, flags)
+    from flowrec.verbs.align import asked_import, fit_import
+    from flowrec.verbs.mission_run import run_mission
+
+    asked = asked_import(movie, chosen, coils=coils, times=times, fps=fps, partial=partial)
+    path = None if out is None else Path(out)
+    looked = fit_import(asked, path.parent if path is not None else Path(), str(robot), align=align)
+    return run_mission(
+        looked.asked,
+        path,
+        overwrite=overwrite,
+        control=control,
+        inputs=inputs,
+        keep_failed=False,
+        given_facts=looked.facts,
+        known=looked.prepared,
+        given_doubts=looked.doubts,
+    )

@@ -1,0 +1,78 @@
+"""`flowrec view`: open a session in the Rerun viewer, take a picture of it, or write layouts for viewers."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flowrec.core import FlowrecError, UsageError
+from flowrec.verbs.command import Told, verb
+from flowrec.verbs.export import export, export_json
+from flowrec.verbs.options import Overwrite
+
+
+@verb(
+    "flowrec view a.mcap",
+    "flowrec view a.mcap --screenshot a.png --time 12",
+    "flowrec view a.mcap --layout .",
+)
+def view(
+    session: Annotated[Path, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd).")],
+    beside: Annotated[
+        Path | None, typer.Argument(metavar="[OTHER]", help="Another session of the same chip, in the same view.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="File to write; by default beside the session, where it replaces an .rrd of that session.",
+        ),
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Save a picture of the viewer instead of opening it.")
+    ] = None,
+    time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Write layouts into this folder by which Foxglove (.json) and Rerun (.rbl) show the .mcap itself.",
+        ),
+    ] = None,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
+    overwrite: Overwrite = False,
+) -> Told:
+    """Write the .rrd of a session and open it in Rerun.
+
+    Raises
+    ------
+    UsageError : outputs that do not go together.
+    SessionError : the session can not be read, or an output not be written; OutputError if it may not be.
+    """
+    from flowrec.core import PICTURE, Output
+    from flowrec.store import files_behind
+    from flowrec.view import open_viewer
+    from flowrec.view import screenshot as take
+
+    if session.suffix == ".rrd" and not session.exists():
+        raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
+    if beside is not None and ".rrd" in (session.suffix, beside.suffix):
+        raise UsageError(f"{session} and {beside}: two sessions (.mcap) are shown in one view, not .rrd files")
+    if layout is not None:
+        if session.suffix == ".rrd" or any(value is not None for value in (beside, out, screenshot, time)):
+            raise UsageError(f"--layout {layout}: is for one session (.mcap) and goes with no other output")
+        from flowrec.exports import write_layouts
+
+        made = write_layouts(session, layout, overwrite)
+        found = {"session": session, "foxglove": made.foxglove, "rerun": made.rerun}
+        return Told(lambda: {key: str(path) for key, path in found.items()}, remarks=lambda: made.advice)
+    if screenshot is not None:
+        Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
+    rrd = session if session.suffix == ".rrd" else export(session, out, overwrite, beside=beside)
+    told: list[str] = []
+    if screenshot is not None:
+        told += [*take(rrd, screenshot, time_s=time, overwrite=overwrite), f"{screenshot} written"]
+    elif not no_open:
+        told += filter(None, [open_viewer(rrd)])
+    return Told(lambda: export_json(session, rrd), remarks=lambda: told)
