@@ -19,9 +19,10 @@ from flowrec.physics.flow.sampling import relative_rmse, sample
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.physics.robot import Robot
 from flowrec.rigs.simulated.bodies import Swimmer
+from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.rigs.simulated.true_walls import at_centres, cut_up, true_walls
-from flowrec.rigs.simulated.world import Pump, Shake, misregister, true_chip, true_depth_um, true_pump, true_robot
+from flowrec.rigs.simulated.world import Shake, misregister, true_chip, true_depth_um, true_pump, true_robot
 from flowrec.stages.config import config_from_toml, load_config, to_toml, with_sets
 from flowrec.stages.pipeline import assemble
 from flowrec.stages.resolve import derived_values, resolve

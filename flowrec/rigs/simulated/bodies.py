@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from flowrec.core import UM_PER_M, FlowField, bilinear, compiled
 from flowrec.physics import Chip, Robot, sample, velocity_at, walls_of
 from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Hindrance, hindered_velocity
-from flowrec.rigs.simulated.world import Pump, true_pump
+from flowrec.rigs.simulated.pump import Pump
+from flowrec.rigs.simulated.world import true_pump
 from flowrec.stages import Simulated
 
 _SUBSTEP_S = 1.0 / 240.0  # at least eight to a frame at 30 per second, at most 4 um at 1000 um/s

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from flowrec.core import FlowError, FlowField, wrap_rad
 from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, median_width_um, with_settings
 from flowrec.rigs.simulated.hindrance import NO_HINDRANCE, Hindrance, walls_around
+from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.true_walls import at_centres, on_pixels, origin_um, true_walls
 from flowrec.stages import Coils, Simulated
 
@@ -26,8 +27,6 @@ _DRAWN = (
 )
 _PULSATION_HZ = (0.05, 2.0)  # of syringe and peristaltic pumps
 _LEAST_DEPTH_RADII = 2.2  # the robot fits in
-_DRIFT_STEP_S = 0.5  # of the pump, linear between
-_FARTHEST_DRIFT = 3.0  # standard deviations: the drift is cut off there
 
 
 def drawn_from(seed: int, quantity: str) -> np.random.Generator:
@@ -97,56 +96,6 @@ def true_robot(robot: Robot, simulated: Simulated) -> Robot:
         step_out_hz=step_out * robot.step_out_hz,
         delay_s=robot.delay_s * late if simulated.delay_s is None else simulated.delay_s,
     )
-
-
-class Pump:
-    """By what factor the flow differs from the steady one: (1 + drift) (1 + share sin(2 pi hz t + phase)).
-
-    The drift is a stationary Ornstein-Uhlenbeck process.
-
-    Parameters
-    ----------
-    pulsation_share, pulsation_hz, phase_rad : of the pulsation.
-    drift_share, drift_s : one sigma of the drift, and its correlation time.
-    rng : its random numbers.
-    """
-
-    def __init__(
-        self,
-        pulsation_share: float,
-        pulsation_hz: float,
-        phase_rad: float,
-        drift_share: float,
-        drift_s: float,
-        rng: np.random.Generator,
-    ) -> None:
-        self._share, self._hz, self._phase_rad = pulsation_share, pulsation_hz, phase_rad
-        self._drift_share = drift_share
-        self._decay = math.exp(-_DRIFT_STEP_S / drift_s)
-        self._rng = rng
-        self._drift = [float(rng.standard_normal())]  # in standard deviations, every _DRIFT_STEP_S
-
-    def strength(self, time_s: float) -> float:
-        """The flow at a time over the steady one."""
-        pulsation = 1.0 + self._share * math.sin(2.0 * math.pi * self._hz * time_s + self._phase_rad)
-        return (1.0 + self._drift_at(time_s)) * pulsation if self._drift_share > 0.0 else pulsation
-
-    def mean_drift(self, until_s: float) -> float:
-        """Mean of 1 + drift from the start to a time: what a steady map of that time is, over the steady flow."""
-        if self._drift_share == 0.0:
-            return 1.0
-        times = np.arange(0.0, max(until_s, _DRIFT_STEP_S), _DRIFT_STEP_S)
-        return 1.0 + float(np.mean([self._drift_at(float(time)) for time in times]))
-
-    def _drift_at(self, time_s: float) -> float:
-        place = max(time_s, 0.0) / _DRIFT_STEP_S
-        index = int(place)
-        while len(self._drift) < index + 2:
-            kick = math.sqrt(1.0 - self._decay**2) * float(self._rng.standard_normal())
-            self._drift.append(self._decay * self._drift[-1] + kick)
-        before, after = self._drift[index : index + 2]
-        drift = before + (place - index) * (after - before)
-        return self._drift_share * min(max(drift, -_FARTHEST_DRIFT), _FARTHEST_DRIFT)
 
 
 def true_pump(simulated: Simulated) -> Pump:

@@ -14,24 +14,10 @@ import numpy as np
 
 from flowrec.core import Demand, Estimate, Floats, FlowField, Mission, Route
 from flowrec.physics import Robot, sample
+from flowrec.stages.control.delay_compensation import CorrectedFlow
 
 _NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are meant for
-_MOST_DEMANDS = 100  # remembered, whatever delay and frame rate
 _LARGEST_CORRECTION = 0.3  # of an error, within one frame
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CorrectedFlow:
-    """The map of the flow, corrected by what the observer finds at the robot."""
-
-    field: FlowField | None
-    correction_um_s: Floats  # (2,) added to the map near the robot; without a map the flow itself
-
-    def at(self, point_um: Floats) -> Floats:
-        """(2,) um/s."""
-        if self.field is None:
-            return self.correction_um_s
-        return sample(self.field, point_um) + self.correction_um_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,60 +180,3 @@ def limit_length(vector: Floats, limit: float) -> tuple[Floats, bool]:
 def speed_ratio(robot: Robot) -> float:
     """Speed in radii per second over that of the robot that the settings are meant for; at least 1."""
     return max(1.0, robot.max_speed_um_s / robot.radius_um / _NOMINAL_RADII_PER_S)
-
-
-def corrected_flow(
-    field: FlowField | None, estimate: Estimate, sent_um_s: Floats, map_error: float, lag_s: float
-) -> CorrectedFlow:
-    """The map plus the observer's residual, weighted by the variances of both.
-
-    The observer's variance is that of the estimate, so an observer without measurements has no weight. An observer that
-    assumes a constant flow lags by about `lag_s`, so the change of the map over the displacement in that time is added
-    to its variance: where the robot enters another stream the map is better. The standard deviation of the map is its
-    own where it states one, else `map_error` times the speed; the correction never exceeds twice that.
-
-    Parameters
-    ----------
-    sent_um_s : (m, 2) demands that may still be on their way to the coils, oldest first.
-    """
-    if field is None:
-        return CorrectedFlow(None, estimate.flow_um_s)
-    mapped = sample(field, estimate.position_um)
-    map_std = map_error * float(np.hypot(*mapped)) + 1.0
-    if field.std_um_s is not None:
-        h, w = field.std_um_s.shape[:2]
-        column, row = np.rint(estimate.position_um / field.um_per_px).astype(int)
-        stated = field.std_um_s[min(max(row, 0), h - 1), min(max(column, 0), w - 1)]
-        map_std = max(0.3 * map_std, float(stated.max()))
-    velocity = mapped + sent_um_s[0] if len(sent_um_s) else mapped
-    change = mapped - sample(field, estimate.position_um - lag_s * velocity)
-    variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3]) + float(change @ change)
-    residual = estimate.flow_um_s - mapped
-    length = float(np.hypot(*residual))
-    weight = min(map_std**2 / (map_std**2 + variance), 2.0 * map_std / length if length > 0.0 else 1.0)
-    return CorrectedFlow(field, weight * residual)
-
-
-def predict_position(
-    position_um: Floats, sent_um_s: Floats, dt_s: float, delay_s: float, flow: CorrectedFlow
-) -> Floats:
-    """(2,) um: the robot after the delay, moved by the demands still on their way and by the flow.
-
-    `sent_um_s` (m, 2), oldest first, were sent one frame (dt_s) apart, the last of them a frame ago. A demand takes
-    effect one delay after it was sent.
-    """
-    point = np.array(position_um, np.float64)
-    elapsed = max(delay_s - len(sent_um_s) * dt_s, 0.0)  # before the first demand only the flow moves the robot
-    point = point + elapsed * flow.at(point)
-    for k in range(len(sent_um_s), 0, -1):
-        until = delay_s - (k - 1) * dt_s  # the demand sent k frames ago acts until its successor does
-        if until > elapsed:
-            point = point + (until - elapsed) * (sent_um_s[-k] + flow.at(point))
-            elapsed = until
-    return point
-
-
-def append_demand(sent_um_s: Floats, velocity_um_s: Floats, dt_s: float, delay_s: float) -> Floats:
-    """(m, 2) the demands with the newest appended, as many as are sent within a delay."""
-    count = min(int(np.ceil(delay_s / dt_s - 1e-9)) + 1, _MOST_DEMANDS) if dt_s > 0.0 else 1
-    return np.concatenate([sent_um_s, velocity_um_s[None]])[-count:]

@@ -2,7 +2,8 @@
 
 from flowrec.stages.estimation.consistency_monitor import HealthMonitor
 from flowrec.stages.estimation.kalman import Kalman
-from flowrec.stages.estimation.observer import Luenberger, Observer
+from flowrec.stages.estimation.luenberger import Luenberger
+from flowrec.stages.estimation.observer import Observer
 from flowrec.stages.estimation.sampler import Sampler, Trimmed
 from flowrec.stages.estimation.smoother import Smoothed, observe, smooth
 

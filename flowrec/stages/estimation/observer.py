@@ -16,16 +16,16 @@ from flowrec.core import (
     Health,
     Method,
     Methods,
-    Range,
     Share,
     Track,
     seconds,
 )
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import Kalman, corrects_map, memory_s
+from flowrec.stages.estimation.luenberger import Luenberger
 
 _GIVEN_UP = 1.5  # times the deviation at which a map is taken up
-_KALMAN, _LUENBERGER = "flowrec.stages.estimation.kalman:Kalman", "flowrec.stages.estimation.observer:Luenberger"
+_KALMAN, _LUENBERGER = "flowrec.stages.estimation.kalman:Kalman", "flowrec.stages.estimation.luenberger:Luenberger"
 # The only option of a row is the section of its settings, an object of the class that implements it.
 OBSERVERS = Methods(
     "observer.method",
@@ -42,54 +42,6 @@ OBSERVERS = Methods(
     group="flowrec.observers",
     verb="estimate",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Luenberger:
-    """`luenberger`, the disturbance observer of the paper, eq. (19): d vhat/dt = L_p (dx/dt - d xhat/dt).
-
-    With xhat' = u + vhat it is a first-order low-pass filter of the measured drift, discretised exactly.
-    """
-
-    gain_per_s: Annotated[float, Range(1e-3, 1e4)] = 1.0  # L_p, the same on both axes
-    # one sigma, for the stated covariance only; None: 4 % of the radius
-    position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
-
-    def estimate(
-        self,
-        previous: Estimate | None,
-        track: Track,
-        applied: Applied,
-        robot: Robot,
-        field: FlowField | None = None,
-    ) -> Estimate:
-        """The position is the measured one; the covariance is nominal, that of filtered noise; `field` is not used."""
-        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius_um
-        moved = robot.um_per_rev * applied.turns
-        flow = np.zeros(2) if previous is None else previous.flow_um_s
-        position = track.position_um
-        dt = 0.0 if previous is None else seconds(track.stamp_ns - previous.stamp_ns)
-        # Weight of the newest drift.
-        weight = 1.0 - math.exp(-self.gain_per_s * dt) if dt > 0 else 0.0
-        if previous is not None and dt > 0:
-            if track.seen and previous.seen:
-                drift = (track.position_um - previous.measured_um - moved) / dt
-                flow = flow + weight * (drift - flow)
-            elif not track.seen:
-                position = previous.position_um + moved + flow * dt
-        # White noise of the positions, differenced over dt and filtered with the weight w, has the stationary variance
-        # 2 / (2 - w) (w sigma / dt)^2, which tends to (gain sigma)^2 for short dt.
-        per_s = weight / dt if dt > 0 else self.gain_per_s
-        flow_variance = 2.0 / (2.0 - weight) * (per_s * sigma_um) ** 2
-        return Estimate(
-            stamp_ns=track.stamp_ns,
-            position_um=position,
-            flow_um_s=flow,
-            covariance=np.diag([sigma_um**2, sigma_um**2, flow_variance, flow_variance]),
-            nis=float("nan"),
-            measured_um=track.position_um,
-            seen=track.seen,
-        )
 
 
 @dataclass(frozen=True, slots=True)
