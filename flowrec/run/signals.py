@@ -26,6 +26,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from types import FrameType
 
 from flowrec.core import Priority, realtime_priority, said_within, status_of, stopped_by
 from flowrec.run.control import RunControl
@@ -92,12 +93,11 @@ class Signals:
             # The pipe outlasts the handlers: a signal that no handler of before sees is in it.
             stack.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(-1))
             signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-            for number in wanted:
-                stack.callback(
-                    signal.signal, number, signal.signal(number, lambda *_: None)
-                )  # its number is in the pipe
-            interrupt = signal.signal(signal.SIGALRM, lambda *_: self._control.interrupt())
-            stack.callback(signal.signal, signal.SIGALRM, interrupt)
+            handlers = dict.fromkeys(wanted, _leave_to_pipe) | {signal.SIGALRM: self._interrupt}
+            for number, handler in handlers.items():
+                # The way back first: a signal may raise between any two of these lines.
+                stack.callback(signal.signal, number, signal.getsignal(number))
+                signal.signal(number, handler)
             thread = threading.Thread(target=self._listen, args=(reading,), name="signals", daemon=True)
             thread.start()
             try:
@@ -113,6 +113,9 @@ class Signals:
             for number in os.read(pipe, 64):
                 if number in _ENDING:
                     self._handle(number)
+
+    def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
+        self._control.interrupt()
 
     # ---- the thread
 
@@ -176,3 +179,7 @@ class Signals:
         self._leave_terminal()
         said_within(_PRINT_S, lambda: print(f"flowrec: {'; '.join(filter(None, lines))}", file=sys.stderr))
         os._exit(1 if watchdog is not None or self._by is None else status_of(self._by))
+
+
+def _leave_to_pipe(_number: int, _frame: FrameType | None) -> None:
+    """Do nothing: the number of the signal is in the pipe."""

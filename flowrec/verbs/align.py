@@ -112,7 +112,7 @@ def _refuse_doubtful(fit: MotionFit, prepared: Prepared) -> None:
 
 
 def align_log(looked: Looked) -> Looked:
-    """What is known, with the clock of the log as the motion shows it, the fit for the head of the session, doubts.
+    """Look at the log: its clock as the motion shows it, the fit for the head of the session, doubts.
 
     Raises
     ------

@@ -75,7 +75,7 @@ class MovieTracks:
 
 
 class Looked(NamedTuple):
-    """What is known of a movie before it is imported.
+    """Findings of a movie before it is imported.
 
     Attributes
     ----------

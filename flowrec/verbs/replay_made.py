@@ -160,7 +160,7 @@ def make_replay(
         return Replay.of(replay_session(session, change, from_s, verify=True, control=control), None)
     with ExitStack() as stack:  # holds the temporary folder, until the object that is returned goes
         if out is None and numbered:
-            out = _numbered(session.path)
+            out = _with_numbers(session.path)
         elif out is None:
             folder = Path(tempfile.mkdtemp(prefix="flowrec-replay-"))
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -182,7 +182,7 @@ def make_replay(
     return made
 
 
-def _numbered(path: Path) -> Path:
+def _with_numbers(path: Path) -> Path:
     """SESSION_replay_NNN.mcap with the first free number."""
     numbered = (named_beside(path, f"{path.stem}_replay_{number:03d}{MCAP[0]}") for number in range(1, 1000))
     out = next((name for name in numbered if not name.exists()), None)

@@ -132,7 +132,7 @@ class SessionComparison:
             different = self._different
             more = [f"{len(different) - _NAMED} more"] if len(different) > _NAMED else []
             found = f"DIFFERENT in {', '.join([*different[:_NAMED], *more])}" + (f"; {other}" if other else "")
-        what = f"{_counted(self.covered.topics, 'topic')} and {_counted(self.covered.head, 'part')} of the head"
+        what = f"{_count_of(self.covered.topics, 'topic')} and {_count_of(self.covered.head, 'part')} of the head"
         return f"{self.covered.sentence(found)} ({what}{self.choice.text})"
 
     @property
@@ -200,7 +200,7 @@ def _names(first: Session, second: Session) -> tuple[str, str]:
     return str(first.path), str(second.path)
 
 
-def _counted(names: Sequence[str], noun: str) -> str:
+def _count_of(names: Sequence[str], noun: str) -> str:
     return f"{len(names)} {noun}{'s' * (len(names) != 1)}"
 
 

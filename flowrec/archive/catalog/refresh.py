@@ -105,7 +105,7 @@ def refresh(
         given = given or [base if out is None else Path()]
         found, tables = contents_of(given, path)
         if not found:
-            raise _emptied(given, len(known.sessions))
+            raise _empty_error(given, len(known.sessions))
         named = {path_text(each.path, base): each for each in found}
         places_before = map(os.fsdecode, known.sessions[PLACE].to_pylist())
         before = dict(zip(places_before, known.sessions[SIGNATURE].to_pylist(), strict=True))
@@ -143,7 +143,7 @@ def _default(places: Sequence[Path]) -> Path:
     return first / NAME if first is not None and not isinstance(first, UrlPath) and first.is_dir() else Path(NAME)
 
 
-def _emptied(places: Sequence[Path], known: int) -> SessionError | UsageError:
+def _empty_error(places: Sequence[Path], known: int) -> SessionError | UsageError:
     """The refusal of places without a session: a disk that is not mounted must not empty the catalog."""
     where = ", ".join(map(str, places))
     if known:

@@ -106,9 +106,10 @@ class Observations(Message):
 
     def followed_by(self, more: Observations) -> Observations:
         """These observations, then more; the stamp is that of the later ones. What one does not state, both do not."""
-        pairs = {name: (array, more._arrays()[name]) for name, array in self._arrays().items()}
+        theirs = more._arrays()
         joined: dict[str, Any] = {
-            name: None if any(each is None for each in pair) else np.concatenate(pair) for name, pair in pairs.items()
+            name: None if array is None or theirs[name] is None else np.concatenate((array, theirs[name]))
+            for name, array in self._arrays().items()
         }
         return replace(more, radius_um=more.radius_um if self.radius_um == more.radius_um else None, **joined)
 
