@@ -27,11 +27,8 @@ class Walls:
         (x, y), (height, width), (x0, y0, x1, y1) = shift_px, self.distance_px.shape, self.box
         to_image = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
         distance = cv2.warpAffine(self.distance_px, to_image, (width, height), borderMode=cv2.BORDER_REPLICATE)
-        columns, rows = (
-            (min(max(each + round(by), 0), most) for each in ends)
-            for ends, by, most in (((x0, x1), x, width), ((y0, y1), y, height))
-        )
-        (left, right), (top, bottom) = columns, rows
+        left, right = (min(max(each + round(x), 0), width) for each in (x0, x1))
+        top, bottom = (min(max(each + round(y), 0), height) for each in (y0, y1))
         return Walls(np.asarray(distance, np.float32), (left, top, right, bottom))
 
 

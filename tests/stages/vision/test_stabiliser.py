@@ -13,6 +13,7 @@ from flowrec.core.messages import Shift, Track
 from flowrec.physics.chip.chip import Chip
 from flowrec.stages.config import load_config
 from flowrec.stages.vision import Stabiliser, Tracker, move_neighbours
+from flowrec.stages.vision.walls import Walls
 from tests.short_missions import SMALL
 from tests.stages.vision.shaky import CALIBRATION, ROBOT, chip, frame, image
 
@@ -86,6 +87,12 @@ def test_the_pixels_around_the_robot_are_not_used_where_the_shaken_image_shows_i
     shift, _ = ON.register(before, background, track, frame(40, shaken), on, CALIBRATION, robot)
     assert shift is not None and np.abs(shift.shift_px - swift).max() < 0.2
     assert shift.found and shift.alike > 0.8
+
+
+def test_the_box_of_the_fluid_moves_with_the_image_along_each_axis_by_its_own_shift() -> None:
+    walls = Walls(np.zeros((100, 300), np.float32), (20, 10, 290, 90))
+    assert walls.for_shift((5.0, -3.0)).box == (25, 7, 295, 87)
+    assert walls.for_shift((40.0, 20.0)).box == (60, 30, 300, 100)  # as far as the image goes
 
 
 def test_the_track_on_a_shaking_stage_is_that_of_the_chip() -> None:
