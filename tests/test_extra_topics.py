@@ -192,7 +192,12 @@ def test_an_input_of_a_package_that_is_not_installed_is_replayed_as_it_was_recor
     assert "need" not in check(flown).facts["replay"]
 
 
-@pytest.mark.parametrize("path", ["/pump/pressure", "/pump/mean", "/pump/leak"])
+AGAIN = pytest.mark.slow("edits, checks, compares and verifies a session again")
+
+
+@pytest.mark.parametrize(
+    "path", ["/pump/mean", *(pytest.param(each, marks=AGAIN) for each in ("/pump/pressure", "/pump/leak"))]
+)
 def test_a_change_in_an_extra_topic_is_found_by_check_compare_and_where_it_is_computed_by_verify(
     flown: Path, tmp_path: Path, path: str
 ) -> None:

@@ -223,7 +223,9 @@ def test_without_the_package_its_session_is_read_and_a_replay_says_what_to_insta
     ("version", "code", "status", "said"),
     [
         ("1.1", ("", ""), 0, "recorded with lab_kit 1.0, replayed with lab_kit 1.1"),
-        ("1.0", ("-> bool", "->  bool"), 0, "recorded with other code of lab_kit 1.0: sha256 "),
+        pytest.param(
+            *("1.0", ("-> bool", "->  bool"), 0, "recorded with other code of lab_kit 1.0: sha256 "), marks=ONCE_MORE
+        ),
         pytest.param(
             *("1.1", ("    neighbours:", "    nodes:"), 2),
             "are not those of lab_kit 1.1 (plan.lab_kit_steps: unknown key",

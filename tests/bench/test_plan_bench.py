@@ -43,6 +43,7 @@ def test_the_least_time_on_a_finer_grid_is_what_a_finer_grid_still_finds():
         assert four == pytest.approx(two, rel=0.02)
 
 
+@pytest.mark.slow("a bench of planners")
 @pytest.mark.parametrize("flow", [(0.0, 0.0), (40.0, 30.0), (-60.0, 0.0)])
 def test_driving_down_the_time_to_go_takes_the_time_that_it_says(flow):
     field = field_of(open_water(), *flow)

@@ -42,6 +42,7 @@ def test_a_tiff_has_the_same_images_and_stamps_and_states_its_scale_as_ome(expor
     assert [plane["DeltaT"] for plane in pixels["Plane"]] == pytest.approx([1e-9 * f.stamp_ns for f in frames])
 
 
+@pytest.mark.slow("exports and reads a whole session")
 def test_a_plain_movie_has_nearly_the_same_images_and_stamps_to_half_a_microsecond(exported):
     frames = list(flowrec.open(GOLDEN).frames)
     with open_movie(exported["mp4_plain"]) as movie:

@@ -123,6 +123,7 @@ def test_however_a_session_is_cut_its_ticks_are_the_same_from_any_time(whole, tm
         assert all(same(tick, replace(whole.tick_before(tick.stamp_ns), true_field=tick.true_field)) for tick in ticks)
 
 
+@pytest.mark.slow("writes and reads a run of very many parts")
 def test_a_run_of_very_many_parts_needs_few_open_files(tmp_path):
     import resource
 

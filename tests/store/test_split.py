@@ -250,7 +250,10 @@ for number, tick in enumerate(ticks_of(10_000, shape=(64, 64))):
 """
 
 
-@pytest.mark.parametrize("moment", [25, 40, 61])
+KILL = pytest.mark.slow("kills a recording in a process of its own, at another moment")
+
+
+@pytest.mark.parametrize("moment", [40, *(pytest.param(each, marks=KILL) for each in (25, 61))])
 def test_a_kill_at_or_about_a_split_leaves_whole_parts_and_a_last_one_to_be_saved(tmp_path, moment):
     path = tmp_path / "x.mcap"
     with subprocess.Popen([sys.executable, "-c", KILLED, path], stdout=subprocess.PIPE, text=True) as run:

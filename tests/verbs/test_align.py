@@ -68,6 +68,7 @@ def test_a_log_that_is_100_ms_late_is_found_though_the_robot_is_not_always_seen(
     assert found["frames"] + found["frames_left_out"] == seen
 
 
+@pytest.mark.slow("tracks and aligns a whole movie")
 def test_um_per_revolution_that_the_motion_refutes_are_replaced_and_both_are_recorded(imported: Path) -> None:
     session = flowrec.open(imported)
     found = json.loads(session.provenance["alignment"])

@@ -92,6 +92,7 @@ def double_time_to_go(channel: Any, _: Any, wire: Any) -> bool:
     return True
 
 
+@pytest.mark.slow("verifies a mission again")
 def test_a_session_whose_times_to_go_were_doubled_is_not_verified(session: Path, tmp_path: Path) -> None:
     assert rewrite(session, tmp_path / "doubled.mcap", double_time_to_go) == 1
     status, said = run("replay", tmp_path / "doubled.mcap", "--verify", "--json")

@@ -89,6 +89,7 @@ def test_two_bodies_alike_are_refused_with_a_picture_and_each_way_to_name_one_ta
         assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow("imports a movie")
 def test_a_body_that_is_alone_needs_no_one_to_name_it(known: Config, tmp_path: Path) -> None:
     done = flowrec.import_movie(movie(tmp_path, ALONE), tmp_path / "a.mcap", known)
     assert done.exit_status == 0 and not done.doubts
@@ -169,6 +170,7 @@ def test_the_reason_why_a_log_does_not_explain_a_track_is_the_one_that_holds() -
     assert "shakes" not in why(driven, shake_px=None)
 
 
+@pytest.mark.slow("imports a movie")
 def test_an_image_without_walls_says_that_shake_can_not_be_seen(known: Config, tmp_path: Path) -> None:
     pictures = [image(None, at, seed=n) for n, at in enumerate(ALONE[:6])]
     flowrec.import_movie(makers.folder(tmp_path / "bare", pictures), tmp_path / "a.mcap", known, fps=5.0)

@@ -328,7 +328,14 @@ def test_walls_that_are_not_where_the_registration_says_are_told_before_the_impo
         assert ("source_walls" in flowrec.info(tmp_path / f"{angle_deg}.mcap")) == told
 
 
-@pytest.mark.parametrize(("share", "way"), [(-0.05, "small"), (0.0, ""), (0.05, "large")])
+@pytest.mark.parametrize(
+    ("share", "way"),
+    [
+        (-0.05, "small"),
+        (0.0, ""),
+        pytest.param(0.05, "large", marks=pytest.mark.slow("imports a movie, to the other side")),
+    ],
+)
 def test_a_scale_that_the_walls_contradict_makes_the_import_doubtful_with_the_setting_to_paste(
     share: float, way: str, lab: Laboratory, tmp_path: Path
 ) -> None:

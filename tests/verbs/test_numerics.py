@@ -79,6 +79,7 @@ def test_two_sessions_of_other_numerics_are_compared_as_such_and_check_names_the
     assert f"made by other numerics (version 1; this is {NUMERICS_VERSION + 1})" in verdict.facts["written"]
 
 
+@pytest.mark.slow("verifies a session by other numerics")
 @pytest.mark.usefixtures("other_numerics")
 def test_an_edited_file_is_told_as_such_whatever_its_numerics(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -89,6 +90,7 @@ def test_an_edited_file_is_told_as_such_whatever_its_numerics(
     assert "NOT the same" in said.splitlines()[-1]
 
 
+@pytest.mark.slow("verifies a session by other numerics")
 def test_a_difference_by_the_same_numerics_is_one(
     session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -286,6 +286,7 @@ def test_a_part_that_arrives_otherwise_is_never_called_pushed(
     assert "does not hold what was sent" in done.failed[large] and not done.files
 
 
+@pytest.mark.slow("records a run in parts and pushes it")
 def test_all_parts_of_a_run_go_with_its_notes_and_notes_that_were_added_later(server: S3Server, tmp_path: Path) -> None:
     run = tmp_path / "x.mcap"
     in_parts(run, [20, 40])

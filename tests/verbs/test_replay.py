@@ -29,6 +29,8 @@ from flowrec.verbs.replay_change import Change
 from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
 
+AGAIN = pytest.mark.slow("verifies a mission from another time")
+
 
 @pytest.fixture
 def computed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -65,7 +67,7 @@ def test_a_replay_is_identical_tick_by_tick_and_its_worker_results_can_be_made_a
     assert len(done.worker.lines) >= 4  # solved, surveyed, refined, planned
 
 
-@pytest.mark.parametrize("share", [0.01, 0.23, 0.77])
+@pytest.mark.parametrize("share", [0.23, *(pytest.param(each, marks=AGAIN) for each in (0.01, 0.77))])
 def test_a_replay_from_any_time_is_identical(session: Path, share: float) -> None:
     reader = SessionReader(session)
     done = verb.replay_session(session, Change(), from_s=round(share * reader.duration_s, 3), verify=True)
@@ -226,6 +228,7 @@ def test_another_controller_changes_the_commands_and_nothing_before_them(session
     assert done.commands.changed > 0
 
 
+@pytest.mark.slow("replays a mission")
 def test_another_observer_changes_estimates_and_leaves_tracks(session: Path, computed: list[str]) -> None:
     done = verb.replay_session(session, Change(observer="luenberger"))
     assert computed == ["survey_route", "refine", "route"]  # all of which read something else now

@@ -206,6 +206,7 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Row]]
     return made_once(tmp_path_factory, "report_replay", make)
 
 
+@pytest.mark.slow("draws a report of a session and a replay")
 def test_a_replay_is_compared_as_the_verb_compares_it_and_what_changed_is_listed(
     replayed: tuple[Path, list[Row]],
 ) -> None:

@@ -37,7 +37,7 @@ def compiled(function: Function) -> Function:
     """The function in machine code; the first call of a new installation takes seconds, later ones load the cache.
 
     What a kernel takes from other files of flowrec, it must take from files with kernels: the cache is keyed by those.
-    A kernel assigns element by element: an array assigned to a slice, `np.where` and `np.interp` take two seconds more
+    A kernel assigns element by element: what is assigned to a slice, `np.where` and `np.interp` take two seconds more
     to compile, most of it for messages that are never shown.
     """
     folder = _cache_folder()

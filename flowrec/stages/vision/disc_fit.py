@@ -188,7 +188,10 @@ def _equations(
     slope: NDArray[np.float64],
 ) -> tuple[float, float, float]:
     """Fill the normal equations at `trial`; return the cost, the robust variance of the residuals and the likeness."""
-    normal[:], slope[:] = 0.0, 0.0
+    for k in range(_PARAMETERS):
+        slope[k] = 0.0
+        for m in range(_PARAMETERS):
+            normal[k, m] = 0.0
     cost, squares, variation, total_weight, weighted_squares = 0.0, 0.0, 0.0, 0.0, 0.0
     row = np.empty(_PARAMETERS)
     cx, cy, radius, edge = trial[_X], trial[_Y], trial[_RADIUS], trial[_EDGE]

@@ -89,7 +89,8 @@ def masked_ncc(
                 _add(cov, pattern[j, k], grey[row + j, first + k :])
         open_fluid = whole[row : row + size].all()
         if not open_fluid:
-            sum_m[:] = 0.0
+            for i in range(span):
+                sum_m[i] = 0.0
             for j in range(size):
                 for k in range(size):
                     part = weight[row + j, first + k :]

@@ -8,7 +8,8 @@ import pytest
 from flowrec.core.messages import Estimate, Route
 from flowrec.stages.control import Controller
 from flowrec.stages.control.controller import CONTROLLERS
-from flowrec.stages.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback, corrected_flow
+from flowrec.stages.control.delay_compensation import corrected_flow
+from flowrec.stages.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback
 from flowrec.stages.control.trajectory import feasible_pace, nearest_time
 from tests.stages.control.plant import ROBOT, field_of, fly, mission, straight
 

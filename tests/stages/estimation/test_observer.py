@@ -325,7 +325,9 @@ def test_a_flow_that_no_robot_could_be_held_in_is_not_believed_for_longer_than_a
     assert np.linalg.norm(after.position_um - track.position_um) < 5.0
 
 
-@pytest.mark.parametrize("gain_per_s", [1.0, 20.0])
+@pytest.mark.parametrize(
+    "gain_per_s", [1.0, pytest.param(20.0, marks=pytest.mark.slow("many flights, with another gain"))]
+)
 def test_the_luenberger_observer_states_the_variance_that_the_noise_of_the_positions_gives_its_flow(
     gain_per_s: float,
 ) -> None:

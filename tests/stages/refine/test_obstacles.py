@@ -64,6 +64,7 @@ def test_a_branch_that_is_half_blocked_is_found_and_the_map_is_right_beside_it(c
     assert within.mean() > 0.9
 
 
+@pytest.mark.slow("refines with every doubt about the chip")
 def test_the_survey_doubts_the_branch_that_carries_too_little_and_then_the_place_that_was_seen(chip, assumed):
     truth = SOLVER.solve(blocked(chip))
     every = observed(truth, chip)
