@@ -141,7 +141,6 @@ def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run
     assert any(action == "zero" and "SIGTERM again" in text for action, text in actions), actions
 
 
-@PROCESS
 def test_ctrl_z_stops_the_process_with_the_field_off_and_fg_ends_the_run(tmp_path: Path) -> None:
     done = ended("SIGTSTP", tmp_path, PATIENT)
     stopped = (tmp_path / "driver.log.stopped").read_text().split("\n")

@@ -82,15 +82,13 @@ def masked_ncc(
             continue
         span = last + 1 - first
         sum_i, sum_i2 = _window_sums(grey, row, first, span, size), _window_sums(square, row, first, span, size)
-        cov, sum_m = np.zeros(span, np.float32), np.full(span, area)
+        open_fluid = whole[row : row + size].all()
+        cov, sum_m = np.zeros(span, np.float32), np.full(span, area if open_fluid else np.float32(0.0))
         sum_t, sum_t2 = np.zeros(span, np.float32), np.zeros(span, np.float32)
         for j in range(size):
             for k in range(size):
                 _add(cov, pattern[j, k], grey[row + j, first + k :])
-        open_fluid = whole[row : row + size].all()
         if not open_fluid:
-            for i in range(span):
-                sum_m[i] = 0.0
             for j in range(size):
                 for k in range(size):
                     part = weight[row + j, first + k :]
