@@ -96,7 +96,9 @@ def test_a_recorder_that_is_killed_stopped_or_stuck_has_no_field_within_the_time
         assert one is not None and one.off_s is not None, fault
         assert one.off_s < 0.1 + max(delays) + SLACK_S, fault
         assert one.stayed_off, fault
-        assert "guardian has switched the coils off: no beat" in one.said or fault != "stop"
+        # Two timers of the same length watch the loop, the guardian's and that of NI's process: either comes first.
+        timers = ("guardian has switched the coils off: no beat", "no order of the loop for 100 ms")
+        assert any(timer in one.said for timer in timers[: 1 if on.kind == "serial" else 2]) or fault != "stop"
 
 
 def commanded(drive: Drive) -> None:
