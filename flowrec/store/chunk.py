@@ -18,17 +18,15 @@ import zstandard
 from mcap.opcode import Opcode
 
 from flowrec.core import FIXED, Frame, SessionError, TopicTable
-from flowrec.store.channels import FRAMES, GROUPS, STATE, codec_of_extra, slots_of
-from flowrec.store.channels import VIEW as VIEW_GROUP
-from flowrec.store.codec import Payload, codec_of, encode_record
+from flowrec.store.channels import FRAMES, GROUPS, STATE, VIEW, slots_of
+from flowrec.store.codec import Encoded, Payload, encode_record
 from flowrec.store.digest import message_digest
 from flowrec.store.frame_encodings import FrameEncoding
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGE_HEAD, RECORD_HEAD, ChannelIndex, SealedChunk
 from flowrec.store.roi import WindowCutter
-from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
 
-_CHUNK_BYTES = {FRAMES: 1 << 20, STATE: 1 << 18, VIEW_GROUP: 1 << 18}  # a chunk is sealed beyond
+_CHUNK_BYTES = {FRAMES: 1 << 20, STATE: 1 << 18, VIEW: 1 << 18}  # a chunk is sealed beyond
 # A message must leave room in the largest chunk that is read for what surrounds it.
 _MESSAGE_LIMIT_BYTES = CHUNK_LIMIT_BYTES - (1 << 20)
 # Noise does not compress: level 1 gets the same 1.2 to 1.6 of a camera image as higher ones, five times quicker.
@@ -134,12 +132,11 @@ class ChunkBuilder:
 
 
 class ChunkEncoder:
-    """Encodes the messages of ticks and their viewer topics, and collects them in chunks by group.
+    """Collects the messages of ticks in chunks by group, and encodes their images.
 
     Parameters
     ----------
     encoding : of the frames.
-    views : makes the viewer topics; shared by all files of a run, because it remembers the colour scale.
     sink : receives sealed chunks and must not keep views of them after it returns. May be replaced between calls.
     start_unix_ns : Unix time of stamp 0, which is added to all times that MCAP and foxglove's schemas hold.
     topics : those of the run.
@@ -150,17 +147,13 @@ class ChunkEncoder:
     sequences : the next sequence number by topic, for topics whose messages do not give their own.
     """
 
-    def __init__(
-        self, encoding: FrameEncoding, views: ViewerTopics, sink: Sink, start_unix_ns: int, topics: TopicTable = FIXED
-    ) -> None:
+    def __init__(self, encoding: FrameEncoding, sink: Sink, start_unix_ns: int, topics: TopicTable = FIXED) -> None:
         self.sink = sink
         self.sequences: Counter[str] = Counter()
         self.start_unix_ns = start_unix_ns
         self._encoding = encoding
-        self._views = views
         self._cutter = WindowCutter()
         self._topics, self._slots = topics.by_field, slots_of(topics)
-        self._extra = {topic.path: codec_of_extra(topic) for topic in topics.extra}
         self._builders = {
             group: ChunkBuilder(compressed=encoding.compressed_chunks or group != FRAMES) for group in GROUPS
         }
@@ -171,23 +164,23 @@ class ChunkEncoder:
         return sum(map(_size_of, self._builders.values()))
 
     def add(self, entry: Entry) -> None:
-        """Encode the messages of one tick; pass full chunks to `sink`.
+        """Take the messages of one tick; pass full chunks to `sink`.
 
         Raises
         ------
-        SessionError : a message that can not be encoded; and what `sink` raises.
+        SessionError : an image that can not be encoded; and what `sink` raises.
         """
         for field, message in entry.messages.items():
             if isinstance(message, Frame):
-                codec = self._encoding.codec
-                if entry.window is not None:
-                    message = self._cutter.cut(message, entry.window)  # noqa: PLW2901  the builder copies it
+                frame = message if entry.window is None else self._cutter.cut(message, entry.window)
+                encoded = encode_record(frame, self._encoding.codec, self.start_unix_ns)  # the builder copies it
             else:
-                codec = self._extra.get(field) or codec_of(type(message))
-            sequence, payload = encode_record(message, codec, self.start_unix_ns)
-            self._append(self._topics[field].path, entry.stamp_ns, message.stamp_ns, payload, sequence)
-        for path, stamp_ns, payload in self._views.of(entry.messages):
-            self._append(path, entry.stamp_ns, stamp_ns, payload, None)
+                encoded = message
+            self.append(self._topics[field].path, entry.stamp_ns, encoded)
+        self.seal_full()
+
+    def seal_full(self) -> None:
+        """Pass the chunks that are full to `sink`."""
         full = [builder for group, builder in self._builders.items() if builder.size >= _CHUNK_BYTES[group]]
         if full:
             self.sink([builder.seal() for builder in full])
@@ -198,7 +191,9 @@ class ChunkEncoder:
         if filled:
             self.sink([builder.seal() for builder in filled])
 
-    def _append(self, path: str, log_ns: int, publish_ns: int, payload: Payload, sequence: int | None) -> None:
+    def append(self, path: str, log_ns: int, encoded: Encoded) -> None:
+        """Take one message of a topic."""
+        publish_ns, sequence, payload = encoded
         if sequence is None:
             sequence = self.sequences[path]
             self.sequences[path] = (sequence + 1) % 2**32

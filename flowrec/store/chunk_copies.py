@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Metadata, MetadataIndex
+from mcap.records import ChunkIndex, Metadata
 from numpy.typing import NDArray
 
-from flowrec.core import BY_PATH, FLOW_FIELDS, Applied, Outcome, SessionError, Timing, message_fields, seconds
-from flowrec.store.channels import Row, SessionContents
+from flowrec.core import BY_PATH, Applied, Outcome, SessionError, Timing, message_fields, seconds
+from flowrec.store.channels import SLOTS, VIEWED, Row, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_format import (
@@ -31,12 +31,11 @@ from flowrec.store.mcap_format import (
 )
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.scan import Scan
-from flowrec.store.session_metadata import DIGEST, OUTCOME, VIEW
-from flowrec.store.viewer_scene import brightest_um_s, drawable
+from flowrec.store.session_metadata import DIGEST, OUTCOME
 from flowrec.store.write_queue import Counters
 
 _MESSAGE_BYTES = RECORD_HEAD.size + MESSAGE_HEAD.size  # of a record besides its payload
-_ANEW = (OUTCOME, DIGEST)  # records of which the new file gets its own
+_ANEW = (OUTCOME, DIGEST, "flowrec.view")  # records of which the new file gets its own; the last is of older files
 _COUNTED = ("ticks", "dropped_frames", "frames_dropped")  # the last one in older files
 _STAMP, _ABSENT = (
     [each.name for each in message_fields(Applied)].index(name) for name in ("stamp_ns", "absent_until_ns")
@@ -172,6 +171,11 @@ class ChunkCopier:
     out : the new file, not begun.
     tally : receives what is kept and what is left out.
 
+    Attributes
+    ----------
+    draws : the viewer topics are not copied, but made again from what is kept. Those of another flowrec, which has
+        declared them otherwise, stay.
+
     Raises
     ------
     OSError : from any method, when the disk refuses.
@@ -181,9 +185,9 @@ class ChunkCopier:
         self._contents, self._source = contents, contents.source
         self._out, self._tally = out, tally
         self._checks = {channel: self._check_of(channel) for channel in contents.fields}
-        self._top_um_s: float | None = None
+        self.draws = all(_declares(contents, slot.channel, path) for path, slot in SLOTS.items() if path in VIEWED)
         out.start(self._source.header.profile, self._source.header.library)
-        self._add_records([each for each in contents.metadata if each.name != VIEW])
+        self._add_records()
         for place in contents.attachments:
             out.add(self._source.record(place.offset, place.length, Opcode.ATTACHMENT))
         for schema in contents.schemas.values():
@@ -198,21 +202,8 @@ class ChunkCopier:
             chunk = self._stored_chunk(place, records) if all(kept) else None
             self._out.add_chunks([chunk or self._rebuilt(place, kept)])
 
-    def finish(self, outcome: dict[str, str]) -> None:
-        """Write the outcome and the index, and sync the file."""
-        views = [each for each in self._contents.metadata if each.name == VIEW]
-        self._add_records(views)
-        part = self._contents.part
-        # The scale of a part is that of the first one's first flow field.
-        if not views and self._top_um_s is not None and (part is None or part.keyframe_ns is None):
-            self._out.add(Metadata(VIEW, {"speed_scale_um_s": repr(self._top_um_s)}))
-        self._out.add(Metadata(OUTCOME, outcome))
-        self._out.add_digest()
-        self._out.finish()
-        self._out.sync()
-
-    def _add_records(self, places: list[MetadataIndex]) -> None:
-        for place in places:
+    def _add_records(self) -> None:
+        for place in self._contents.metadata:
             if place.name not in _ANEW:
                 self._out.add(Metadata(place.name, self._source.metadata(place)))
 
@@ -221,8 +212,10 @@ class ChunkCopier:
         if record.channel not in self._contents.channels:
             self._tally.undeclared += 1
             return False
+        if self.draws and self._contents.channels[record.channel].topic in VIEWED:
+            return False
         check = self._checks.get(record.channel)
-        if check is None:  # of a viewer topic, or of another program
+        if check is None:  # of another program
             return True
         try:
             check(record)
@@ -239,16 +232,7 @@ class ChunkCopier:
             decode = self._contents.decode
             return lambda record: self._tally.add(field, record.log_ns, (decode(record).stamp_ns,))
         row_of = self._contents.row_decoder(channel)
-        is_field = field in FLOW_FIELDS
-
-        def check(record: Record) -> None:
-            row = row_of(record)
-            if is_field and self._top_um_s is None:
-                flow = self._contents.decode(record)
-                self._top_um_s = brightest_um_s(flow) if drawable(flow) else None
-            self._tally.add(field, record.log_ns, row)
-
-        return check
+        return lambda record: self._tally.add(field, record.log_ns, row_of(record))
 
     def _stored_chunk(self, place: ChunkIndex, records: list[Record]) -> SealedChunk | None:
         """The chunk as it is in the file; None where it lacks a checksum, or holds something besides messages."""
@@ -287,3 +271,8 @@ class ChunkCopier:
                 builder.add(channel, sequence, log_unix_ns, publish_unix_ns, payload)
                 times.append(log_unix_ns)
         return replace(builder.seal(), message_start_time=min(times), message_end_time=max(times))
+
+
+def _declares(contents: SessionContents, channel: int, path: str) -> bool:
+    found = contents.channels.get(channel)
+    return found is not None and found.topic == path

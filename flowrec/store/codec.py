@@ -15,7 +15,7 @@ import math
 import operator
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -35,6 +35,15 @@ from flowrec.core import (
 from flowrec.store.schema import ARRAY_DATA, Schema, array_schema, foxglove_schema, schema_of
 
 Payload = tuple[bytes | memoryview, ...]
+
+
+class Encoded(NamedTuple):
+    """A message as it is stored: its stamp, the MCAP sequence that it must have, if any, and its payload."""
+
+    stamp_ns: int
+    sequence: int | None
+    payload: Payload
+
 
 _UNCOPIED_BYTES = 1 << 14  # a larger array bypasses protobuf when it is written
 _LARGE_BYTES = 1 << 16  # in a larger message arrays bypass protobuf when it is read
@@ -90,8 +99,8 @@ def codec_of(message_type: type[Any], path: str = "") -> Codec:
     return codec
 
 
-def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
-    """The MCAP sequence that a message must have, if any, and the parts of its payload.
+def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> Encoded:
+    """A message as it is stored; large arrays are not copied.
 
     `start_unix_ns` is the Unix time at which the session clock is 0.
 
@@ -99,15 +108,16 @@ def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> tuple[i
     ------
     SessionError : a value does not fit the message's declaration, such as an int beyond 64 bit.
     """
+    stamp_ns = message.stamp_ns
     if start_unix_ns and codec.has_unix_time:
-        message = replace(message, stamp_ns=message.stamp_ns + start_unix_ns)
+        message = replace(message, stamp_ns=stamp_ns + start_unix_ns)
     try:
         sequence = codec.sequence(message) if codec.sequence is not None else None
         try:
-            return sequence, codec.encode(message)
+            return Encoded(stamp_ns, sequence, codec.encode(message))
         except UnicodeEncodeError:
             # A lone surrogate from a terminal must not end a run: it is stored as an escape sequence.
-            return sequence, codec.encode(_without_surrogates(message))
+            return Encoded(stamp_ns, sequence, codec.encode(_without_surrogates(message)))
     except (TypeError, ValueError, OverflowError) as error:
         raise SessionError(f"a {type(message).__name__} at {message.stamp_ns} ns can not be stored: {error}") from error
 

@@ -17,7 +17,7 @@ from mcap.records import ChunkIndex
 from flowrec.core import Frame, Message, SessionError, pixel_type
 from flowrec.store.channels import Row, SessionContents
 from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
-from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
+from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, Summary, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.write_queue import NewMessages
 
@@ -43,19 +43,20 @@ class FileReader(SessionContents):
     Parameters
     ----------
     cache : restored messages, shared by the files of a run.
+    summary : an index to be used instead of the file's own, whose end is not written yet.
     """
 
-    def __init__(self, path: Path, cache: Cache | None = None) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, cache: Cache | None = None, summary: Summary | None = None) -> None:
+        super().__init__(path, summary)
         self._cache: Cache = cache if cache is not None else {}
         self._frame_channels = self._channels_of({"frame"})
         encoding = ENCODINGS.get(self.frame_encoding)
         self._lossless = encoding is None or encoding.lossless
 
-    def new_messages(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, NewMessages]]:
-        """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
+    def new_messages(self, start_ns: int | None, fields: Collection[str]) -> Iterator[tuple[int, NewMessages]]:
+        """Stamp and new messages of some topics of all ticks, or of those at and after `start_ns`."""
         size = _StateSize(self.source.path)
-        for stamp_ns, records in itertools.groupby(self._records_from(start_ns, with_frames), key=_by_time):
+        for stamp_ns, records in itertools.groupby(self._records_from(start_ns, fields), key=_by_time):
             new: NewMessages = {}
             for record in records:
                 field = self.fields[record.channel]
@@ -138,15 +139,15 @@ class FileReader(SessionContents):
             del self._cache[next(iter(self._cache))]
         return message
 
-    def _records_from(self, start_ns: int | None, with_frames: bool) -> Iterator[Record]:
-        """The messages of known topics from a time on, state and frames merged."""
+    def _records_from(self, start_ns: int | None, fields: Collection[str]) -> Iterator[Record]:
+        """The messages of some topics from a time on, state and frames merged."""
         start = 0 if start_ns is None else start_ns
         state, frames = self._chunks_from(start)
-        wanted = set(self.fields) if with_frames else set(self.fields) - self._frame_channels
+        wanted = self._channels_of(fields)
         read = dict.fromkeys(wanted, 0)
         with _threads() as executor:
             streams = [_merge(self.source, state, executor)]
-            if with_frames:
+            if wanted & self._frame_channels:
                 streams.append(_merge(self.source, frames, executor, self._decoded_frame))
             for record in heapq.merge(*streams, key=_by_time):
                 if record.log_ns >= start and record.channel in wanted:

@@ -35,7 +35,7 @@ from mcap.records import (
 
 from flowrec.core import SessionError, open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
-from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary, parse_summary
 
 _BUFFERS_PER_WRITE = 1024
 
@@ -131,18 +131,8 @@ class McapWriter:
         """Write data end, summary and footer; then the file is complete."""
         self._append(_bytes_of(DataEnd(data_section_crc=self._crc)))
         start = self.size
-        listed = self._summary
-        listed.count(self._counts, self._chunk_count, self._first_ns, self._last_ns)
-        assert listed.statistics is not None
         summary, offsets = bytearray(), bytearray()
-        for opcode, group in (
-            (Opcode.SCHEMA, _bytes_of(*listed.schemas.values())),
-            (Opcode.CHANNEL, _bytes_of(*listed.channels.values())),
-            (Opcode.STATISTICS, _bytes_of(listed.statistics)),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, _bytes_of(*listed.attachments)),
-            (Opcode.METADATA_INDEX, _bytes_of(*listed.metadata)),
-        ):
+        for opcode, group in self._groups():
             if group:
                 offsets += _bytes_of(SummaryOffset(opcode, start + len(summary), len(group)))
                 summary += group
@@ -151,6 +141,22 @@ class McapWriter:
         # The checksum covers all of the summary up to itself, the last four bytes of the footer.
         tail = bytes(summary + offsets) + footer[:-4]
         self._append(tail + zlib.crc32(tail).to_bytes(4, "little") + MAGIC)
+
+    def summary(self) -> Summary:
+        """The summary of what was added so far, in Unix time, for a reader of the unfinished file."""
+        return parse_summary(b"".join(group for _, group in self._groups()), len(MAGIC), self.size)
+
+    def _groups(self) -> Iterator[tuple[Opcode, bytes | bytearray]]:
+        """The records of the summary by kind."""
+        listed = self._summary
+        listed.count(self._counts, self._chunk_count, self._first_ns, self._last_ns)
+        assert listed.statistics is not None
+        yield Opcode.SCHEMA, _bytes_of(*listed.schemas.values())
+        yield Opcode.CHANNEL, _bytes_of(*listed.channels.values())
+        yield Opcode.STATISTICS, _bytes_of(listed.statistics)
+        yield Opcode.CHUNK_INDEX, self._chunks
+        yield Opcode.ATTACHMENT_INDEX, _bytes_of(*listed.attachments)
+        yield Opcode.METADATA_INDEX, _bytes_of(*listed.metadata)
 
     def sync(self) -> None:
         """Force what was appended to the disk; may run in another thread than the other methods."""

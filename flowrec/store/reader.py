@@ -138,7 +138,7 @@ class SessionReader:
                 continue
             # A file that is read from its beginning is compared with the counts in its index.
             late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
-            for stamp_ns, new in self._file(number).new_messages(late_ns, with_frames=with_frames):
+            for stamp_ns, new in self._file(number).new_messages(late_ns, self._choose_fields(with_frames=with_frames)):
                 if not number or stamp_ns > file.first_ns:
                     tick = self.topics.with_messages(tick, stamp_ns, new)
                     yield tick
@@ -150,7 +150,7 @@ class SessionReader:
         message of its first tick is new if and only if it is another object.
         """
         begun = [number for number, file in enumerate(self._run.files) if file.first_ns <= stamp_ns]
-        wanted = {field for field in self.topics.by_field if with_frames or field != "frame"}
+        wanted = self._choose_fields(with_frames=with_frames)
         found_ns, known = -1, dict[str, Any]()
         # The keyframe of a part has the state; what is missing there is searched for in the parts before.
         for number in reversed(begun):
@@ -159,6 +159,9 @@ class SessionReader:
                 latest_ns, state = self._file(number).state_at(stamp_ns, missing)
                 found_ns, known = max(found_ns, latest_ns), known | state
         return self.topics.with_messages(Tick(), found_ns, known)
+
+    def _choose_fields(self, *, with_frames: bool) -> set[str]:
+        return {field for field in self.topics.by_field if with_frames or field != "frame"}
 
     def messages(self, field: str) -> Iterator[Any]:
         """All messages of one topic, named by its field of Tick or by its path.

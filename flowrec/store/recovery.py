@@ -7,9 +7,21 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flowrec.core import MCAP, Outcome, Output, OutputError, SessionError, hold_file, put_in_place, refuse_irregular
+from mcap.records import Metadata
+
+from flowrec.core import (
+    MCAP,
+    FlowrecError,
+    Outcome,
+    Output,
+    OutputError,
+    SessionError,
+    hold_file,
+    put_in_place,
+    refuse_irregular,
+)
 from flowrec.store.audit import disagreements, edits_of
-from flowrec.store.channels import SessionContents
+from flowrec.store.channels import SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
 from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_reader import DamageError, McapReader
@@ -30,11 +42,13 @@ from flowrec.store.session_metadata import (
     CHIP_FILE,
     CHIP_IMAGE_FILE,
     CONFIG_FILE,
+    OUTCOME,
     PROVENANCE,
     SESSION,
     Part,
 )
 from flowrec.store.session_path import on_this_machine
+from flowrec.store.viewer_pass import draw
 from flowrec.store.writer import SessionWriter
 
 _REMAINS_SUFFIX = ".remains"
@@ -197,8 +211,25 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
                 f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; "
                 "remove the file"
             )
-        copier.finish(kept.outcome)
+        out.add(Metadata(OUTCOME, kept.outcome))
+        if copier.draws:
+            draw(draft, out, contents.source.start_unix_ns, _left_out(contents))
+        out.add_digest()
+        out.finish()
+        out.sync()
     return kept
+
+
+def _left_out(contents: SessionContents) -> frozenset[str]:
+    """The topics that the run was not to record; none where its settings can not be read."""
+    from flowrec.stages import config_from_toml
+
+    try:
+        header = contents.header
+        config = config_from_toml(header.config_toml, "config.toml", header.provenance)
+        return left_out(config.recording.leave_out, contents.topics)
+    except FlowrecError:
+        return frozenset()
 
 
 def _nothing_on_disk(path: Path) -> NothingSavedError:

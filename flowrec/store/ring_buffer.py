@@ -20,7 +20,7 @@ from flowrec.store.run_files import partial_path, snapshot_path
 from flowrec.store.segments import Segment, SegmentedRun
 from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
-from flowrec.store.write_queue import Counters, Entry, NewMessages
+from flowrec.store.write_queue import Counters, EncodedMessages, Entry, NewMessages
 
 _SEGMENT_S, _SEGMENTS = 1.0, 8  # length of a segment in s, at most this fraction of the ring
 _EVENTS_LISTED = 20  # of one snapshot
@@ -53,7 +53,7 @@ class _SnapshotFile(SessionFile):
 class _RingSegment(Segment):
     """Consecutive ticks: in memory, or written to a snapshot."""
 
-    def __init__(self, encoder: ChunkEncoder, state: NewMessages, keyframe_ns: int | None) -> None:
+    def __init__(self, encoder: ChunkEncoder, state: EncodedMessages, keyframe_ns: int | None) -> None:
         super().__init__(encoder, keyframe_ns)
         self.state = state  # at the keyframe
         self.sequences = Counter(encoder.sequences)
@@ -125,8 +125,6 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         self._ring: deque[_RingSegment] = deque()  # without those that still wait for images
         self._is_short = False  # the ring has been too small since it began to fill
         self._snapshot: _SnapshotFile | None = None
-        self._dropped = 0
-        self._dropped_ns: int | None = None
         self.open.append(self._segment())
         # Make a file and remove it, so that an error is reported at the start and not at the event.
         file = SessionFile(snapshot_path(path, 1), header, options)
@@ -150,9 +148,8 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             elif snapshot is None and self._is_full(entry.stamp_ns):
                 self._cut(self._segment())
         self._route(entry)
-        event = self._event_in(entry)
-        if event:
-            self._take(event, entry.stamp_ns)
+        if entry.event:
+            self._take(entry.event, entry.stamp_ns)
 
     def flush(self) -> None:
         pass  # see flushed_ns
@@ -183,7 +180,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         if self._free:
             encoder = self._free.pop()
         else:
-            encoder = self._encoder(self._views, _discard)
+            encoder = self._encoder(_discard)
             encoder.sequences = self._sequences
         return _RingSegment(encoder, dict(self._state), self._last_ns)
 
@@ -247,7 +244,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             short = f"{held_s:.1f} of {self._settings.before_s:g} s before the event"
             snapshot.shortage = {"short_of_memory": short}
         if first.keyframe_ns is not None:
-            encoder = self._encoder(self._views.copy(), snapshot.put)
+            encoder = self._encoder(snapshot.put)
             # Numbered as if they had been written just before what follows.
             encoder.sequences = Counter({topic: (number - 1) % 2**32 for topic, number in first.sequences.items()})
             snapshot.write_keyframe(encoder, Entry(first.keyframe_ns, first.state, 0))
@@ -270,9 +267,18 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         self._snapshot, self._is_short = None, False
         self._cut(self._segment())
 
-    def _event_in(self, entry: Entry) -> str:
-        """The event in this entry that a snapshot is taken for, as text; empty: none."""
-        event, operator, drops = map(entry.messages.get, ("event", "operator", "drops"))
+
+class SnapshotTrigger:
+    """Finds what a snapshot is taken for: a mark, a note, a warning, an error, the first lost image."""
+
+    def __init__(self, settings: Snapshot) -> None:
+        self._before_ns = nanoseconds(settings.before_s)
+        self._dropped = 0
+        self._dropped_ns: int | None = None
+
+    def event_in(self, stamp_ns: int, messages: NewMessages) -> str:
+        """The event in the new messages of a tick, as text; empty: none."""
+        event, operator, drops = map(messages.get, ("event", "operator", "drops"))
         if isinstance(operator, OperatorEvent) and operator.action in (Action.MARK, Action.NOTE):
             return f"{operator.action}: {operator.text}".rstrip(": ")
         if isinstance(event, Event) and event.level in (Level.WARNING, Level.ERROR):
@@ -281,8 +287,8 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             dropped = drops.by_backlog + drops.by_camera
             if dropped > self._dropped:
                 # Where images are lost all the time, the first one is the event.
-                began = self._dropped_ns is None or entry.stamp_ns - self._dropped_ns > self._before_ns
-                self._dropped, self._dropped_ns = dropped, entry.stamp_ns
+                began = self._dropped_ns is None or stamp_ns - self._dropped_ns > self._before_ns
+                self._dropped, self._dropped_ns = dropped, stamp_ns
                 return "images are lost" if began else ""
         return ""
 

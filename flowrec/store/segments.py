@@ -26,8 +26,7 @@ from flowrec.store.mcap_writer import FileError
 from flowrec.store.run_files import part_path
 from flowrec.store.session_file import SessionFile, Split, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
-from flowrec.store.viewer_topics import ViewerTopics
-from flowrec.store.write_queue import Counters, Entry, NewMessages
+from flowrec.store.write_queue import Counters, EncodedMessages, Entry
 
 
 class Segment(ABC):
@@ -81,8 +80,7 @@ class SegmentedRun(ABC, Generic[S]):
         self.files: list[Path] = []
         self.open: deque[S] = deque()
         self._path, self._header, self._options, self._run = path, header, options, run
-        self._views = ViewerTopics.of_session(header, options.left_out_topics)
-        self._state: NewMessages = {}  # the latest message of each topic but the image, by field of Tick, ...
+        self._state: EncodedMessages = {}  # the latest message of each topic but the image, by field of Tick, ...
         self._last_ns: int | None = None  # ... at the tick with this stamp
         self._image: Frame | None = None
         self._unfinished: list[SessionFile] = []
@@ -112,7 +110,6 @@ class SegmentedRun(ABC, Generic[S]):
     def begin_at(self, start_unix_ns: int) -> None:
         """Take another Unix time of stamp 0, before anything was added."""
         self._header = replace(self._header, start_unix_ns=start_unix_ns)
-        self._views.begin_at(start_unix_ns)
         self.open[-1].encoder.start_unix_ns = start_unix_ns
 
     @abstractmethod
@@ -150,9 +147,9 @@ class SegmentedRun(ABC, Generic[S]):
         """The files that have not received all that belongs into them."""
         return [file for file in self._unfinished if file.completion is None]
 
-    def _encoder(self, views: ViewerTopics, sink: Sink) -> ChunkEncoder:
+    def _encoder(self, sink: Sink) -> ChunkEncoder:
         options = self._options
-        return ChunkEncoder(options.encoding, views, sink, self._header.start_unix_ns, options.topics)
+        return ChunkEncoder(options.encoding, sink, self._header.start_unix_ns, options.topics)
 
     def _route(self, entry: Entry) -> None:
         """Pass one entry to its segment."""
@@ -192,7 +189,7 @@ class SegmentedRun(ABC, Generic[S]):
     def _complete(self, file: SessionFile, outcome: Mapping[str, str], counters: Counters) -> None:
         """Complete a file in the side thread."""
         outcome = {**outcome, **counters.summary(self._options.encoding)}
-        file.completion = self._side.submit(file.complete, outcome, self._views.top_um_s)
+        file.completion = self._side.submit(file.complete, outcome)
 
     def _collect_finished(self, *, wait: bool = False) -> None:
         """Note the files that are complete; raises the error of a file."""
@@ -342,10 +339,10 @@ class Parts(SegmentedRun[PartSegment]):
         path = part_path(self._path, number) if self._split else self._path
         file = SessionFile(path, self._header_of(number, keyframe_ns), self._options)
         self._unfinished.append(file)
-        encoder = self._encoder(self._views, file.put)
+        encoder = self._encoder(file.put)
         if keyframe is not None:
             encoder.sequences.update(self._options.topics.by_field[field].path for field in keyframe.messages)
-            file.write_keyframe(self._encoder(self._views.copy(), file.put), keyframe)
+            file.write_keyframe(self._encoder(file.put), keyframe)
         return PartSegment(file, encoder, number, keyframe_ns)
 
     def _header_of(self, number: int, keyframe_ns: int | None) -> SessionHeader:

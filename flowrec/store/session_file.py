@@ -33,7 +33,8 @@ from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.mcap_writer import FileError, disk_errors, new_mcap, not_writable
 from flowrec.store.roi import Region
 from flowrec.store.run_files import partial_path
-from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
+from flowrec.store.session_metadata import OUTCOME, PROFILE, SessionHeader, header_records
+from flowrec.store.viewer_pass import draw
 from flowrec.store.write_queue import Entry
 
 _POLL_S = 0.05
@@ -193,6 +194,7 @@ class SessionFile:
 
     def _write_head(self, header: SessionHeader) -> None:
         options = self._options
+        self._start_unix_ns = header.start_unix_ns
         self._file.start(PROFILE, f"flowrec {__version__}")
         for record in (*header_records(header), *declarations(options.encoding, options.region, options.topics)):
             self._file.add(record)
@@ -324,14 +326,14 @@ class SessionFile:
         if self.failure is not None:
             raise self.failure
 
-    def complete(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
-        """Write outcome, colour scale of the views and summary behind all else, sync, and rename the file."""
+    def complete(self, outcome: Mapping[str, str]) -> None:
+        """Write outcome, viewer topics and summary behind all else, sync, and rename the file."""
         self._side.shutdown()
         self.check()
         with self._mark_failed():
-            if top_um_s is not None:
-                self._file.add(Metadata(VIEW, {"speed_scale_um_s": repr(top_um_s)}))
-            self._file.add(Metadata(OUTCOME, dict(outcome)))
+            self._file.add(Metadata(OUTCOME, dict(outcome)))  # before the drawings: without them nothing is lost
+            if self.partial_path.exists():  # else its folder was renamed: recovery draws
+                draw(self.partial_path, self._file, self._start_unix_ns, self._options.left_out_topics)
             self._file.add_digest()
             self._file.finish()
             self._file.sync()

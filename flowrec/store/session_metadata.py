@@ -27,7 +27,6 @@ PROVENANCE = "flowrec.provenance"
 PARENT = "flowrec.parent"
 PART = "flowrec.part"
 OUTCOME = "flowrec.outcome"
-VIEW = "flowrec.view"
 DIGEST = "flowrec.digest"
 # Attachments.
 CONFIG_FILE = "config.toml"

@@ -6,7 +6,6 @@ image's topic, because Rerun's own layout of a file shows an image with all that
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +20,8 @@ from flowrec.store.schema import Schema, foxglove_schema
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene, drawable
 
+# The fields of Tick that viewer topics are made of.
+INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations"))
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
 _NEVER = -(1 << 62)
 
@@ -54,7 +55,6 @@ class ViewerTopics:
         for view in VIEWER_TOPICS:
             if view.path not in left_out:
                 self._views.setdefault(view.input, []).append(view)
-        self._left_out = left_out
         self._scene = ViewerScene() if scene is None else scene
         self._placed: tuple[object, object] = (None, None)  # picture and map whose cameras were described last
         self._goal: object = None
@@ -65,19 +65,6 @@ class ViewerTopics:
     def of_session(cls, header: SessionHeader, left_out: frozenset[str]) -> ViewerTopics:
         """Those of a session with this header."""
         return cls(ViewerScene(ChipCamera.of(header), header.start_unix_ns), left_out)
-
-    @property
-    def top_um_s(self) -> float | None:
-        """Speed at the bright end of the colour scale; None before the first flow field."""
-        return self._scene.top_um_s
-
-    def begin_at(self, start_unix_ns: int) -> None:
-        """Take another Unix time of stamp 0."""
-        self._scene.start_unix_ns = start_unix_ns
-
-    def copy(self) -> ViewerTopics:
-        """One for the keyframe of another file, which describes the cameras anew; with the present colour scale."""
-        return ViewerTopics(copy.copy(self._scene), self._left_out)
 
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
         """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""

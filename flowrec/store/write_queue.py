@@ -11,11 +11,13 @@ from collections import deque
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-from flowrec.core import NS_PER_S
+from flowrec.core import NS_PER_S, Frame
+from flowrec.store.codec import Encoded
 from flowrec.store.frame_encodings import FrameEncoding
 from flowrec.store.roi import Window
 
 NewMessages = dict[str, Any]  # the new messages of one tick by field of Tick, in the order of the topic table
+EncodedMessages = dict[str, Encoded | Frame]  # the same, as they are stored; images are encoded by the recorder
 
 # One in 2, 4, 8 and 16 images is kept when the queue is filled to these ratios.
 _DECIMATE_ABOVE = (0.5, 0.625, 0.75, 0.875)
@@ -24,7 +26,7 @@ _RESTORE_AFTER_S, _LONGEST_RESTORE_AFTER_S = 1.0, 32.0
 
 
 class Entry(NamedTuple):
-    """The new messages of one tick, or its image, and about how many bytes they take in memory.
+    """The new messages of one tick, or its image, and how many bytes they take in memory.
 
     Attributes
     ----------
@@ -34,10 +36,11 @@ class Entry(NamedTuple):
     late : this is that image.
     dropped, missing : images that the writer left out, and that the camera has not delivered, since the entry before.
     window : of the image, where not all of it is recorded.
+    event : in it, for which a snapshot is taken, as text; empty: none.
     """
 
     stamp_ns: int
-    messages: NewMessages
+    messages: EncodedMessages
     nbytes: int
     ticks: int = 0
     image_bytes: int = 0
@@ -45,6 +48,7 @@ class Entry(NamedTuple):
     dropped: int = 0
     missing: int = 0
     window: Window | None = None
+    event: str = ""
 
 
 @dataclass(slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import operator
 import os
@@ -15,8 +14,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-
 from flowrec.core import (
     NO_EXTRA,
     NS_PER_S,
@@ -25,37 +22,30 @@ from flowrec.core import (
     Drops,
     Extra,
     Frame,
-    Message,
     Outcome,
     Priority,
     SessionError,
     Tick,
-    array_fields,
     nanoseconds,
     prioritise_thread,
     remove_idle,
     shape_error,
 )
-from flowrec.store.channels import FRAME_PATH
-from flowrec.store.ring_buffer import RingBuffer
+from flowrec.store.channels import FRAME_PATH, codec_of_extra
+from flowrec.store.codec import codec_of, encode_record
+from flowrec.store.ring_buffer import RingBuffer, SnapshotTrigger
 from flowrec.store.roi import WindowSelector
 from flowrec.store.run_files import refuse_if_taken, run_files
 from flowrec.store.segments import Parts
 from flowrec.store.session_file import Snapshot, WriterOptions
 from flowrec.store.session_metadata import SessionHeader
-from flowrec.store.write_queue import Entry, FrameDecimation, NewMessages, WriteQueue
+from flowrec.store.write_queue import EncodedMessages, Entry, FrameDecimation, NewMessages, WriteQueue
 
 _NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
 _DROPS_EVERY_NS = NS_PER_S // 2
-_MESSAGE_BYTES = 500  # about the size of a message without its pixels
+_IMAGE_BYTES = 500  # of an image besides its pixels
 _FIELDS = tuple(topic.field for topic in TOPICS)
 _messages_of: Callable[[Tick], tuple[Any, ...]] = operator.attrgetter(*_FIELDS)
-
-
-@functools.cache
-def _pixel_fields(message_type: Any) -> tuple[str, ...]:
-    """Images and rasters, of which the bytes are counted; most vectors are too short to matter."""
-    return tuple(name for name, dtype in array_fields(message_type) if dtype != np.float64)
 
 
 class SessionWriter:
@@ -109,6 +99,10 @@ class SessionWriter:
         self._failure: BaseException | None = None
         self._closed = False
         self._extra = NO_EXTRA
+        self._extra_codecs = {topic.path: codec_of_extra(topic) for topic in options.topics.extra}
+        self._start_unix_ns = header.start_unix_ns
+        self._begin_unix_ns: int | None = None  # the same, where the recorder does not know it yet
+        self._trigger = SnapshotTrigger(options.files) if isinstance(options.files, Snapshot) else None
         self._left_out = [topic.field for topic in options.topics.topics if topic.path in options.left_out_topics]
         refuse_if_taken(self.path, overwrite=options.overwrite, inputs=inputs)
         # Only what was there before this run may be removed after it.
@@ -166,6 +160,7 @@ class SessionWriter:
             )
         if self._first_ns is None:
             self._first_ns = tick.stamp_ns
+            self._begin_at_clocks(tick)
         elif self._block and tick.stamp_ns - self._flush_ns >= self._first_ns:
             self._queue.wait_for_flush(min(self._last_ns, tick.stamp_ns - self._flush_ns))
             self._raise_failure()
@@ -183,17 +178,19 @@ class SessionWriter:
         if isinstance(frame, Frame) and (self._block or self._takes(frame)):
             window = self._selector.window_of(frame, tick.track) if self._selector is not None else None
             if not self._block:
-                image = Entry(tick.stamp_ns, {"frame": frame}, _nbytes(frame), late=True, window=window)
+                image = Entry(tick.stamp_ns, {"frame": frame}, _frame_bytes(frame), late=True, window=window)
         self._add_drops(new, tick.stamp_ns)
+        encoded = self._encode(new)
         entry = Entry(
             tick.stamp_ns,
-            new,
-            sum(map(_nbytes, new.values())),
+            encoded,
+            _size_of(encoded),
             ticks,
             image_bytes=image.nbytes if image is not None else 0,
             dropped=self.dropped_frames - dropped,
             missing=self.missing_frames - missing,
             window=window if self._block else None,
+            event=self._trigger.event_in(tick.stamp_ns, new) if self._trigger is not None else "",
         )
         if self._block and not self._queue.has_room(entry.nbytes):
             self._queue.wait_for_room(entry.nbytes)
@@ -263,7 +260,7 @@ class SessionWriter:
                 error.add_note(str(second))
 
     def _new_messages(self, tick: Tick) -> NewMessages:
-        # This and `put` are all of the writer that runs in the control loop: some 50 us.
+        # This, `_encode` and `put` are all of the writer that runs in the control loop: some 100 us.
         messages = _messages_of(tick)
         last, self._last = self._last, messages
         new: NewMessages = {}
@@ -293,13 +290,26 @@ class SessionWriter:
                 raise SessionError(f"{self.path}: {path}: {fault}")
             new[path] = message
 
+    def _encode(self, new: NewMessages) -> EncodedMessages:
+        encoded: EncodedMessages = {}
+        for field, message in new.items():
+            if isinstance(message, Frame):
+                encoded[field] = message
+                continue
+            try:
+                codec = self._extra_codecs.get(field) or codec_of(type(message))
+                encoded[field] = encode_record(message, codec, self._start_unix_ns)
+            except SessionError as error:
+                raise SessionError(f"{self.path}: {error}; what was recorded before it is kept") from error
+        return encoded
+
     def _takes(self, frame: Frame) -> bool:
         """True if there is room for an image of a live run; counts those that are missing."""
         if self._next_index is not None and frame.index > self._next_index:
             self.missing_frames += frame.index - self._next_index
         self._next_index = frame.index + 1
         kept = self._decimation.keeps(self._queue.fill, frame.stamp_ns)
-        if kept and self._queue.has_room(_nbytes(frame)):
+        if kept and self._queue.has_room(_frame_bytes(frame)):
             return True
         self.dropped_frames += 1
         return False
@@ -320,14 +330,13 @@ class SessionWriter:
         if self._block and sys.platform == "linux":  # only there has each thread a priority of its own
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        begin_by_clocks = self._options.start_by_clocks
         try:
             while not self._queue.drained:
                 entry = self._queue.take(self._output.timeout_s)
                 if entry is not None:
-                    if begin_by_clocks:
-                        begin_by_clocks = False
-                        self._begin_at_clocks(entry)
+                    if self._begin_unix_ns is not None:
+                        begin_unix_ns, self._begin_unix_ns = self._begin_unix_ns, None
+                        self._output.begin_at(begin_unix_ns)
                     self._output.add(entry)
                 if entry is None and self._queue.flush_wanted:
                     self._output.flush()
@@ -342,18 +351,18 @@ class SessionWriter:
             self._failure = error
             self._queue.abandon()
 
-    def _begin_at_clocks(self, first: Entry) -> None:
+    def _begin_at_clocks(self, first: Tick) -> None:
         """Let the session begin when its first tick was, by the host's clock: to prepare the run has taken a while."""
-        clocks = first.messages.get("clocks")
-        if isinstance(clocks, Clocks):
-            self._output.begin_at(clocks.wall_ns - clocks.stamp_ns)
+        clocks = first.clocks
+        if self._options.start_by_clocks and isinstance(clocks, Clocks):
+            self._start_unix_ns = self._begin_unix_ns = clocks.wall_ns - clocks.stamp_ns
 
     def _finish(self, outcome: Mapping[str, str], dropped: int, why: str) -> None:
         """Complete the output after the end of the thread; `dropped` images were left in the queue."""
         if dropped:
             self.dropped_frames += dropped
             drops = Drops(self._last_ns, FRAME_PATH, self.dropped_frames, self.missing_frames, self._decimation.every)
-            self._output.add(Entry(self._last_ns, {"drops": drops}, 0))  # at the last tick, because no other comes
+            self._output.add(Entry(self._last_ns, self._encode({"drops": drops}), 0))  # no other tick comes
         self._output.finish(outcome, why)
         if not self.files:  # what was there before may stay
             return
@@ -373,11 +382,12 @@ class SessionWriter:
             raise self._failure
 
 
-def _nbytes(message: Message) -> int:
-    nbytes = _MESSAGE_BYTES
-    kind: Any = type(message)
-    for name in _pixel_fields(kind):
-        pixels = getattr(message, name)
-        if pixels is not None:
-            nbytes += pixels.nbytes
-    return nbytes
+def _size_of(messages: EncodedMessages) -> int:
+    """Bytes of messages in memory."""
+    return sum(
+        _frame_bytes(each) if isinstance(each, Frame) else sum(map(len, each.payload)) for each in messages.values()
+    )
+
+
+def _frame_bytes(frame: Frame) -> int:
+    return _IMAGE_BYTES + frame.image.nbytes

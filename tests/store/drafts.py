@@ -150,7 +150,7 @@ def small_draft() -> Draft:
                 chunks.append([])
         for topic in TOPICS:
             message = made_up(topic.type, stamp_ns, number, rng)
-            sequence, payload = encode_record(message, message_codec(topic.type))
+            _, sequence, payload = encode_record(message, message_codec(topic.type))
             slot = SLOTS[topic.path]
             sent[slot.group][-1].append(
                 Sent(slot.channel, number if sequence is None else sequence, stamp_ns, b"".join(payload))

@@ -25,11 +25,23 @@ from flowrec.core.topics import Tick
 from flowrec.store import codec
 from flowrec.store.channels import message_codec
 from flowrec.store.session_metadata import SessionHeader
+from flowrec.store.write_queue import Entry
 
 
 def encode(message, schema=""):
     """A message as bytes, in the schema where it has several."""
-    return b"".join(codec.encode_record(message, message_codec(type(message), schema))[1])
+    return b"".join(codec.encode_record(message, message_codec(type(message), schema)).payload)
+
+
+def entry_of(stamp_ns, *messages, **given):
+    """An entry of the write queue with messages of a tick, which are named as their types are."""
+    encoded = {
+        type(each).__name__.lower(): each
+        if isinstance(each, Frame)
+        else codec.encode_record(each, message_codec(type(each)), START_UNIX_NS)
+        for each in messages
+    }
+    return Entry(stamp_ns, encoded, **given)
 
 
 def decode(kind, payload, sequence=0, schema=""):

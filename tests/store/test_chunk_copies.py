@@ -10,20 +10,22 @@ from mcap.opcode import Opcode
 
 from flowrec.core.errors import SessionError
 from flowrec.store.channels import SLOTS
+from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, records_in
 from flowrec.store.mcap_reader import McapReader
+from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
 from flowrec.store.session_file import SessionFile, Snapshot, Split, WriterOptions
-from flowrec.store.session_metadata import DIGEST, OUTCOME, VIEW
+from flowrec.store.session_metadata import DIGEST, OUTCOME
+from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.writer import SessionWriter
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
-from tests.store.test_recovery import chunks_of, cut, flush_every
+from tests.store.test_recovery import DRAWN, chunks_of, cut, flush_every
 
 FRAMES, TRACK = SLOTS["/camera/frame"].channel, SLOTS["/robot/track"].channel
-ROBOT = SLOTS["/view/robot_pose"].channel
-AT_END = (OUTCOME, DIGEST, VIEW)
+AT_END = (OUTCOME, DIGEST)
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 RUNS = {
     "raw": WriterOptions(frames="raw", block=True),
@@ -68,12 +70,12 @@ def messages_of(path):
 
 
 def stored_chunks(path, channels=None):
-    """The chunks as they are in the file, all of them or those of just some channels."""
+    """The chunks as they are in the file, all but the drawn ones or those of just some channels."""
     source = McapReader(path)
     return [
         bytes(source.body(chunk.chunk_start_offset, chunk.chunk_length, Opcode.CHUNK))
         for chunk, _ in contents_of(source)
-        if channels in (None, set(chunk.message_index_offsets))
+        if channels == (found := set(chunk.message_index_offsets)) or (channels is None and not found <= DRAWN)
     ]
 
 
@@ -88,8 +90,8 @@ def head_of(path):
 def places_of_a_cut(path):
     """In a chunk and after a chunk of each group of topics, and in the index."""
     ends = {}
-    for start, end, channels in chunks_of(path)[6:]:
-        ends.setdefault(FRAMES if channels == {FRAMES} else min(channels) > 21, (start, end))
+    for start, end, channels in (*chunks_of(path)[6:], *chunks_of(path, drawn=True)):
+        ends.setdefault(FRAMES if channels == {FRAMES} else channels <= DRAWN, (start, end))
     size = path.stat().st_size
     return [at for start, end in ends.values() for at in ((start + end) // 2, end)] + [size - 100, int(0.8 * size)]
 
@@ -106,18 +108,7 @@ def test_of_a_cut_file_every_chunk_and_all_of_its_head_is_copied_as_it_is(files,
         assert not recover(done.path).changed
 
 
-@pytest.mark.parametrize(("run", "known"), [("delta", True), ("part", False)])
-def test_the_colour_scale_is_that_of_the_run_where_the_file_tells_it(files, run, known, tmp_path):
-    def scales(path):
-        source = McapReader(path)
-        return [source.metadata(each) for each in scan(source).summary.metadata if each.name == VIEW]
-
-    saved = recover(cut(files[run], chunks_of(files[run])[-1][0], tmp_path / "s.mcap.partial"))
-    # A part does not begin with the first flow field, by which the scale was chosen.
-    assert scales(saved.path) == (scales(files[run]) if known else [])
-
-
-@pytest.mark.parametrize("which", [FRAMES, TRACK, ROBOT])
+@pytest.mark.parametrize("which", [FRAMES, TRACK])
 def test_a_damaged_chunk_costs_no_byte_of_the_others(files, which, tmp_path):
     start, end, _ = [chunk for chunk in chunks_of(files["delta"]) if which in chunk[2]][4]
     content = bytearray(files["delta"].read_bytes())
@@ -127,6 +118,34 @@ def test_a_damaged_chunk_costs_no_byte_of_the_others(files, which, tmp_path):
     done = recover(path)
     (lost,) = set(stored_chunks(files["delta"])) - set(stored_chunks(done.path))
     assert lost == files["delta"].read_bytes()[start + RECORD_HEAD.size : end] and not done.complete
+
+
+def drawn_of(path):
+    return {channel: messages for channel, messages in messages_of(path).items() if channel in DRAWN}
+
+
+@pytest.mark.parametrize("harm", ["cut", "flipped"])
+def test_drawings_that_are_lost_or_damaged_are_made_again_and_nothing_is_missing(files, harm, tmp_path):
+    whole, content = files["delta"], bytearray(files["delta"].read_bytes())
+    start, end, _ = chunks_of(whole, drawn=True)[0]
+    content[(start + end) // 2] ^= 0xFF
+    path = tmp_path / "s.mcap.partial"
+    path.write_bytes(content if harm == "flipped" else content[: (start + end) // 2])
+    done = recover(path)
+    assert done.complete and SessionReader(done.path).outcome["outcome"] == "ended"
+    assert drawn_of(done.path) == drawn_of(whole) and len(drawn_of(whole)) > 5
+
+
+def test_drawings_follow_all_that_was_recorded_and_are_those_of_its_ticks(files):
+    assert chunks_of(files["delta"], drawn=True)[0][0] > chunks_of(files["delta"])[-1][0]
+    views, expected = ViewerTopics.of_session(HEADER, frozenset()), {}
+    with FileReader(files["delta"]) as file:
+        for log_ns, messages in file.new_messages(None, set(file.fields.values())):
+            for topic, stamp_ns, payload in views.of(messages):
+                times = log_ns + START_UNIX_NS, stamp_ns + START_UNIX_NS
+                expected.setdefault(SLOTS[topic].channel, []).append((times, b"".join(payload)))
+    found = drawn_of(files["delta"])
+    assert {n: [(tuple(head[1:]), payload) for head, payload in each] for n, each in found.items()} == expected
 
 
 def test_an_image_that_makes_no_sense_under_a_right_checksum_is_left_out_alone(files, tmp_path):
@@ -160,9 +179,9 @@ def test_a_chunk_without_a_checksum_gets_one(files, tmp_path):
 
 def test_a_session_of_an_older_flowrec_stays_as_that_one_wrote_it(tmp_path):
     path = cut(GOLDEN, GOLDEN.stat().st_size // 3, tmp_path / "s.mcap.partial")
-    chunks, head = stored_chunks(path), head_of(path)
+    messages, head = messages_of(path), head_of(path)
     done = recover(path)
-    assert stored_chunks(done.path) == chunks and head_of(done.path) == head and not recover(done.path).changed
+    assert messages_of(done.path) == messages and head_of(done.path) == head and not recover(done.path).changed
 
 
 def test_what_reads_back_otherwise_than_it_was_written_is_no_session(files, tmp_path, monkeypatch):

@@ -335,7 +335,7 @@ def test_a_hostile_declaration_is_refused_in_one_line(tmp_path: Path, monkeypatc
     with pytest.raises(UsageError, match="is a topic of flowrec"):
         declared_topic("/robot/track", declaration(TOPIC))
     monkeypatch.setattr(channels, "declaration", lambda _topic: HOSTILE["unknown kind"])
-    recorded(tmp_path / "a.mcap")
+    recorded(tmp_path / "a.mcap", leave_out=("/view/*",))  # or it would be read to be drawn
     with pytest.raises(SessionError, match=r"a\.mcap: the declaration of '/pump/pressure' is damaged") as broken:
         Session(tmp_path / "a.mcap").last  # noqa: B018
     assert "\n" not in str(broken.value)

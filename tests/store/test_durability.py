@@ -31,7 +31,7 @@ from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
 from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S
-from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, entry_of, ticks_of
 
 
 class GatedDisk:
@@ -388,7 +388,7 @@ def test_with_the_shipped_settings_a_power_cut_costs_a_second_on_the_slowest_dis
     file = parts.open[-1].file
     kept_ns, asked, lost_s, syncs = TICKS_BEGIN_NS, None, [], 0
     for tick in ticks_of(400, shape=(8, 8)):  # 6.7 s
-        parts.add(Entry(tick.stamp_ns, {"track": tick.track, "truth": tick.truth}, 500, 1))
+        parts.add(entry_of(tick.stamp_ns, tick.track, tick.truth, nbytes=500, ticks=1))
         parts.flush_if_due()
         if asked is None and file.is_syncing:  # for what the operating system has now
             asked = parts.flushed_ns, now_s[0] + 0.49

@@ -39,7 +39,7 @@ LOSSLESS = [name for name, encoding in ENCODINGS.items() if encoding.lossless]
 
 def there_and_back(frame, encoding):
     encoding = encoding.of(frame.bits)
-    sequence, parts = codec.encode_record(frame, encoding.codec)
+    _, sequence, parts = codec.encode_record(frame, encoding.codec)
     return codec.decode(Frame, encoding.codec, b"".join(parts), sequence)
 
 
@@ -199,7 +199,7 @@ def test_an_image_file_that_claims_more_pixels_than_it_can_hold_is_refused_unrea
 def test_a_damaged_image_file_is_a_session_error_or_an_image(data):
     name, bits = data.draw(st.sampled_from([("delta", 8), ("png", 8), ("jpeg", 8), ("delta", 12), ("png", 12)]))
     frames = ENCODINGS[name].of(bits).codec
-    _, parts = codec.encode_record(Frame(5, 7, np.full((20, 30), 90, pixel_type(bits)), bits), frames)
+    parts = codec.encode_record(Frame(5, 7, np.full((20, 30), 90, pixel_type(bits)), bits), frames).payload
     payload = bytearray(b"".join(parts))
     for _ in range(data.draw(st.integers(1, 3))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))

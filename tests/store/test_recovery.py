@@ -15,7 +15,7 @@ from flowrec.core.errors import SessionError
 from flowrec.core.system.locks import is_growing
 from flowrec.core.topics import TOPICS
 from flowrec.run.recorded import RecordedRig
-from flowrec.store.channels import SLOTS
+from flowrec.store.channels import SLOTS, VIEW
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
@@ -56,11 +56,15 @@ def flush_every(ticks):
     return flush_if_due
 
 
-def chunks_of(path):
-    """Start, end and channels of each chunk."""
+DRAWN = {slot.channel for slot in SLOTS.values() if slot.group == VIEW}
+
+
+def chunks_of(path, *, drawn=False):
+    """Start, end and channels of each chunk that was recorded, or of those that were drawn from them."""
     source = McapReader(path)
     found = scan(source).summary.chunks
-    return [(c.chunk_start_offset, c.chunk_start_offset + c.chunk_length, set(c.message_index_offsets)) for c in found]
+    every = [(c.chunk_start_offset, c.chunk_start_offset + c.chunk_length, set(c.message_index_offsets)) for c in found]
+    return [chunk for chunk in every if (chunk[2] <= DRAWN) == drawn]
 
 
 def cut(path, length, to):

@@ -8,9 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,6 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from flowrec.core.errors import SessionError
-from flowrec.core.messages import OperatorEvent
 from flowrec.core.topics import Tick
 from flowrec.core.units import NS_PER_S, seconds
 from flowrec.store.channels import SLOTS
@@ -30,11 +28,9 @@ from flowrec.store.recovery import recover
 from flowrec.store.run_files import part_path, run_files
 from flowrec.store.scan import scan
 from flowrec.store.segments import Parts
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.viewer_topics import ViewerTopics
-from flowrec.store.write_queue import Entry
+from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.writer import SessionWriter
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import GatedDisk, slow_disk
 
@@ -146,9 +142,9 @@ def test_a_part_counts_the_images_that_still_wait_for_it_until_they_have_come(tm
     parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, frames="raw"), split, "run")
     first = parts.open[0]
     ticks = list(ticks_of(12, shape=(200, 200)))
-    image = {tick.stamp_ns: Entry(tick.stamp_ns, {"frame": tick.frame}, 40_000, late=True) for tick in ticks}
+    image = {tick.stamp_ns: entry_of(tick.stamp_ns, tick.frame, nbytes=40_000, late=True) for tick in ticks}
     for tick in ticks[:4]:
-        parts.add(Entry(tick.stamp_ns, {"track": tick.track}, 500, ticks=1, image_bytes=40_000))
+        parts.add(entry_of(tick.stamp_ns, tick.track, nbytes=500, ticks=1, image_bytes=40_000))
     assert (first.awaited, first.awaited_bytes) == (4, 160_000)
     for number, tick in enumerate(ticks[:4]):
         parts.add(image[tick.stamp_ns])
@@ -276,20 +272,6 @@ def test_a_kill_at_or_about_a_split_leaves_whole_parts_and_a_last_one_to_be_save
     assert len(stamps) > moment - (0.05 + 0.1) * NS_PER_S / PERIOD_NS
 
 
-@pytest.mark.parametrize("split", [Split(seconds=0.3), Snapshot(0.3, 0.3)])
-def test_what_makes_views_is_used_by_one_thread(tmp_path, monkeypatch, split):
-    used, make = {}, ViewerTopics.of
-
-    def noted(mirrors, news):
-        used.setdefault(id(mirrors), (mirrors, set()))[1].add(threading.get_ident())
-        return make(mirrors, news)
-
-    monkeypatch.setattr(ViewerTopics, "of", noted)
-    marked = replace(TICKS[60], operator=OperatorEvent(TICKS[60].stamp_ns, "mark", ""))
-    record(tmp_path / "x.mcap", split, ticks=[*TICKS[:60], marked, *TICKS[61:]], block=True)
-    assert len(used) > 1 and all(len(threads) == 1 for _, threads in used.values())
-
-
 def copy_as_it_is(folder, to):
     """The files of a folder in which one may get its name just now."""
     while True:
@@ -327,7 +309,7 @@ def test_the_operating_system_has_a_part_before_the_next_one_begins_though_image
     split = Split(seconds=0.3)
     parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, flush_s=100.0), split, "run")
     for tick in TICKS[:30]:
-        parts.add(Entry(tick.stamp_ns, {"track": tick.track}, 500, ticks=1, image_bytes=64))
+        parts.add(entry_of(tick.stamp_ns, tick.track, nbytes=500, ticks=1, image_bytes=64))
     first, second = parts.open
     assert first.awaited and first.file.flushed_ns == second.keyframe_ns
     parts.close()

@@ -111,8 +111,6 @@ def test_what_did_not_move_is_drawn_once_and_a_robot_out_of_sight_is_pale():
     assert colours[0].b < colours[0].r == 1.0 and colours[1].r == colours[1].b
     gone = seen(views, {"mission": replace(mission, stamp_ns=late, goal_um=np.full(2, np.nan))})
     assert not gone["/camera/frame/goal"].data
-    # Another file needs all of it again.
-    assert {"/view/frames", "/view/camera", "/view/robot_mark"} <= seen(views.copy(), {"track": track}).keys()
 
 
 def test_plotted_numbers_are_those_of_the_observer_and_of_the_map_where_the_robot_is():

@@ -1,0 +1,42 @@
+"""Draws a recorded file: its viewer topics, made in one pass from the messages in it, and written behind them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flowrec.store.channels import VIEWED
+from flowrec.store.chunk import ChunkEncoder
+from flowrec.store.codec import Encoded
+from flowrec.store.file_reader import FileReader
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.viewer_topics import INPUTS, ViewerTopics
+
+
+def draw(path: Path, out: McapWriter, start_unix_ns: int, left_out: frozenset[str]) -> None:
+    """Add the viewer topics to a file that holds all of its messages, and none of these topics.
+
+    Parameters
+    ----------
+    path, out : the file, and what writes it.
+    start_unix_ns : Unix time of stamp 0.
+    left_out : viewer topics that are not wanted.
+
+    Raises
+    ------
+    SessionError : the file can not be read back. OSError : the disk refuses.
+    """
+    if left_out >= VIEWED:
+        return
+    summary = out.summary()
+    if not summary.chunks:
+        return
+    summary.to_session_clock(start_unix_ns)
+    encoder = ChunkEncoder(ENCODINGS["raw"], out.add_chunks, start_unix_ns)
+    with FileReader(path, summary=summary) as file:
+        views = ViewerTopics.of_session(file.header, left_out)
+        for log_ns, messages in file.new_messages(None, fields=INPUTS):
+            for topic, stamp_ns, payload in views.of(messages):
+                encoder.append(topic, log_ns, Encoded(stamp_ns, None, payload))
+            encoder.seal_full()
+    encoder.seal()
