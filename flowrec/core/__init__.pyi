@@ -63,6 +63,7 @@ from .summary import (
 )
 from .system.blas_threads import one_blas_thread as one_blas_thread
 from .system.bounded_process import BoundedProcess as BoundedProcess
+from .system.shared_ring import SharedRing as SharedRing
 from .system.child_process import ChildProcess as ChildProcess, Parent as Parent
 from .system.durable import (
     append_line as append_line, put_in_place as put_in_place, replace_content as replace_content,

@@ -71,8 +71,10 @@ class Recording:
     full_every_s: Annotated[float, Range(0.0, 1e6)] = 10.0
     region_pad_px: Annotated[int, Range(0, 10_000)] = 16  # margin around what the tracker read
     leave_out: tuple[str, ...] = ()  # topics that are not recorded, as in ["/view/*", "/truth/*"]
-    # Limit of the data that waits for the disk; from half of it on, a live run records fewer frames. None: two seconds
-    # of the camera's images, but 256 MB to 1 GB, because disks sometimes stop for most of a second.
+    # a process of its own records, and completes the file however the run ends; False: a thread of the run
+    own_process: bool = True
+    # Limit of the data that waits for the recorder; from half of it on, a live run records fewer frames. None: four
+    # seconds of the camera's images, but 64 MB to 1.25 GB; in a live run all of it is taken before the run begins.
     queue_mb: Annotated[float, Range(1e-3, 1e6)] | None = None
     # Size and duration after which a run continues in another file; None or 0: one file.
     split_mb: Annotated[float, Range(0.0, 1e9)] | None = None
@@ -87,7 +89,8 @@ class Recording:
     # In real time, before the file begins: the mission's methods are compiled, and for so long the camera's images are
     # processed and written for trial, s. A machine that does not hold them is refused. 0: the run begins at once.
     admission_s: Annotated[float, Range(0.0, 60.0)] = 2.0
-    accept_losses: bool = False  # record also where the trial says that images will be lost
+    # record also where the trial says that images will be lost, and go on when the recorder fails
+    accept_losses: bool = False
     recover_leftovers: bool = True  # recover what killed runs have left in the same folder
     operator: str = ""
     notes: str = ""

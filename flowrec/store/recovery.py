@@ -49,6 +49,7 @@ from flowrec.store.session_metadata import (
 )
 from flowrec.store.session_path import on_this_machine
 from flowrec.store.viewer_pass import draw
+from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.writer import SessionWriter
 
 _REMAINS_SUFFIX = ".remains"
@@ -213,7 +214,8 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
             )
         out.add(Metadata(OUTCOME, kept.outcome))
         if copier.draws:
-            draw(draft, out, contents.source.start_unix_ns, _left_out(contents))
+            camera, start_unix_ns = ChipCamera.of(contents.header), contents.source.start_unix_ns
+            draw(draft, out, camera, start_unix_ns, _left_out(contents))
         out.add_digest()
         out.finish()
         out.sync()

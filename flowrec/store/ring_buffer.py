@@ -8,7 +8,7 @@ and what follows goes to the same file.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from flowrec.store.run_files import partial_path, snapshot_path
 from flowrec.store.segments import Segment, SegmentedRun
 from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
+from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.write_queue import Counters, EncodedMessages, Entry, NewMessages
 
 _SEGMENT_S, _SEGMENTS = 1.0, 8  # length of a segment in s, at most this fraction of the ring
@@ -101,7 +102,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
     Parameters
     ----------
     settings : what a snapshot contains.
-    remarks : receives what happens, as text.
+    tell : receives what happens, as text.
     """
 
     def __init__(
@@ -109,13 +110,14 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         path: Path,
         header: SessionHeader,
         options: WriterOptions,
+        camera: ChipCamera | None,
         settings: Snapshot,
         run: str,
-        remarks: deque[str],
+        tell: Callable[[str], None],
     ) -> None:
-        super().__init__(path, header, options, run)
+        super().__init__(path, header, options, camera, run)
         self._settings = settings
-        self._remarks = remarks
+        self._tell = tell
         self._before_ns, self._after_ns = nanoseconds(settings.before_s), nanoseconds(settings.after_s)
         self._segment_ns = min(nanoseconds(_SEGMENT_S), self._before_ns // _SEGMENTS)
         self._limit_bytes = int(1e6 * settings.megabytes)
@@ -186,7 +188,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
 
     def _note_finished(self, file: SessionFile) -> None:
         super()._note_finished(file)
-        self._remarks.append(f"{file.path}: whole, {file.size / 1e6:.1f} MB")
+        self._tell(f"{file.path}: whole, {file.size / 1e6:.1f} MB")
 
     def _is_full(self, stamp_ns: int) -> bool:
         segment = self.open[-1]
@@ -215,7 +217,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             if not old and not self._is_short:
                 self._is_short = True
                 held_s = seconds(now_ns - (begin_ns or now_ns))
-                self._remarks.append(
+                self._tell(
                     f"the last {held_s:.1f} of {self._settings.before_s:g} s fit into {self._settings.megabytes:g} MB;"
                     " set recording.snapshot_mb higher, or a slower camera"
                 )
@@ -255,7 +257,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             segment.write_to(snapshot)
         snapshot.encoders += [segment.encoder for segment in self.open if not segment.discarded]
         self._ring.clear()
-        self._remarks.append(f"{path}: {held_s:.1f} s before and what follows; {event}")
+        self._tell(f"{path}: {held_s:.1f} s before and what follows; {event}")
         return snapshot
 
     def _end_snapshot(self, outcome: Mapping[str, str]) -> None:

@@ -26,6 +26,7 @@ from flowrec.store.mcap_writer import FileError
 from flowrec.store.run_files import part_path
 from flowrec.store.session_file import SessionFile, Split, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
+from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.write_queue import Counters, EncodedMessages, Entry
 
 
@@ -63,7 +64,7 @@ class SegmentedRun(ABC, Generic[S]):
 
     Parameters
     ----------
-    path, header, options : of the run.
+    path, header, options, camera : of the run.
     run : a random word for the heads of its files.
 
     Attributes
@@ -76,10 +77,13 @@ class SegmentedRun(ABC, Generic[S]):
     SessionError : from any method, when the disk refuses, or a message can not be encoded.
     """
 
-    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, run: str) -> None:
+    def __init__(
+        self, path: Path, header: SessionHeader, options: WriterOptions, camera: ChipCamera | None, run: str
+    ) -> None:
         self.files: list[Path] = []
         self.open: deque[S] = deque()
         self._path, self._header, self._options, self._run = path, header, options, run
+        self._camera = camera
         self._state: EncodedMessages = {}  # the latest message of each topic but the image, by field of Tick, ...
         self._last_ns: int | None = None  # ... at the tick with this stamp
         self._image: Frame | None = None
@@ -189,7 +193,7 @@ class SegmentedRun(ABC, Generic[S]):
     def _complete(self, file: SessionFile, outcome: Mapping[str, str], counters: Counters) -> None:
         """Complete a file in the side thread."""
         outcome = {**outcome, **counters.summary(self._options.encoding)}
-        file.completion = self._side.submit(file.complete, outcome)
+        file.completion = self._side.submit(file.complete, outcome, self._camera)
 
     def _collect_finished(self, *, wait: bool = False) -> None:
         """Note the files that are complete; raises the error of a file."""
@@ -259,8 +263,16 @@ class Parts(SegmentedRun[PartSegment]):
     split : when the next part begins.
     """
 
-    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, split: Split, run: str) -> None:
-        super().__init__(path, header, options, run)
+    def __init__(
+        self,
+        path: Path,
+        header: SessionHeader,
+        options: WriterOptions,
+        camera: ChipCamera | None,
+        split: Split,
+        run: str,
+    ) -> None:
+        super().__init__(path, header, options, camera, run)
         self._split = split
         self._until_ns: int | None = None
         first = self._part(1)

@@ -35,6 +35,7 @@ from flowrec.store.roi import Region
 from flowrec.store.run_files import partial_path
 from flowrec.store.session_metadata import OUTCOME, PROFILE, SessionHeader, header_records
 from flowrec.store.viewer_pass import draw
+from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.write_queue import Entry
 
 _POLL_S = 0.05
@@ -86,7 +87,7 @@ class WriterOptions:
     block : what to do when the disk is slower than the run. True: `write` waits (simulation), also while more than
         `flush_s` of stamps is not yet with the operating system. False: images are decimated (write_queue.py) and
         counted; nothing else is ever dropped (live run).
-    queue_limit_bytes : size of the queue to the writer's thread.
+    queue_limit_bytes : size of the queue to the recorder.
     files : a Split: the run X.mcap is written to the files X.part001.mcap, X.part002.mcap, ..., each of which is
         readable alone; a Snapshot: nothing is written but X.snap001.mcap, ... around events.
     region : record only the window around the robot of most images (roi.py); None: all of all images.
@@ -95,6 +96,8 @@ class WriterOptions:
     keep_failed : False: a session that an exception ends leaves no file, and what `overwrite` would replace stays.
     clock : monotonic time in s, by which data is flushed and synced.
     topics : those of the run.
+    accept_losses : a run whose recorder fails goes on; `close` raises the failure. False: `write` raises it.
+    own_process : record in a process of its own, which finishes the files however the run ends.
     start_by_clocks : stamp 0 is at the time of day that the first tick's /run/clocks says; the header's is a guess.
     """
 
@@ -110,6 +113,8 @@ class WriterOptions:
     bits: int = 8
     keep_failed: bool = True
     clock: Callable[[], float] = time.monotonic
+    accept_losses: bool = False
+    own_process: bool = False
     start_by_clocks: bool = False
     topics: TopicTable = FIXED
 
@@ -326,14 +331,14 @@ class SessionFile:
         if self.failure is not None:
             raise self.failure
 
-    def complete(self, outcome: Mapping[str, str]) -> None:
-        """Write outcome, viewer topics and summary behind all else, sync, and rename the file."""
+    def complete(self, outcome: Mapping[str, str], camera: ChipCamera | None) -> None:
+        """Write outcome, viewer topics (of this camera) and summary behind all else, sync, and rename the file."""
         self._side.shutdown()
         self.check()
         with self._mark_failed():
             self._file.add(Metadata(OUTCOME, dict(outcome)))  # before the drawings: without them nothing is lost
             if self.partial_path.exists():  # else its folder was renamed: recovery draws
-                draw(self.partial_path, self._file, self._start_unix_ns, self._options.left_out_topics)
+                draw(self.partial_path, self._file, camera, self._start_unix_ns, self._options.left_out_topics)
             self._file.add_digest()
             self._file.finish()
             self._file.sync()

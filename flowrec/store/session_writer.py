@@ -17,9 +17,9 @@ from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.store.writer import SessionWriter
 
-_QUEUE_S = 2.0
+_QUEUE_S = 4.0
 _LARGEST_PICTURE_BYTES = 50_000_000
-_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
+_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 64_000_000, 1_250_000_000
 
 
 def session_writer(
@@ -69,6 +69,8 @@ def session_writer(
         leave_out=config.recording.leave_out,
         bits=config.camera.bits,
         keep_failed=keep_failed,
+        accept_losses=live and config.recording.accept_losses,
+        own_process=parent is None and config.recording.own_process,
         start_by_clocks=parent is None,
         topics=topics_of(config) if topics is None else topics,
     )

@@ -10,15 +10,17 @@ from flowrec.store.codec import Encoded
 from flowrec.store.file_reader import FileReader
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.store.viewer_topics import INPUTS, ViewerTopics
 
 
-def draw(path: Path, out: McapWriter, start_unix_ns: int, left_out: frozenset[str]) -> None:
+def draw(path: Path, out: McapWriter, camera: ChipCamera | None, start_unix_ns: int, left_out: frozenset[str]) -> None:
     """Add the viewer topics to a file that holds all of its messages, and none of these topics.
 
     Parameters
     ----------
     path, out : the file, and what writes it.
+    camera : of the session; None if its settings are not known.
     start_unix_ns : Unix time of stamp 0.
     left_out : viewer topics that are not wanted.
 
@@ -34,7 +36,7 @@ def draw(path: Path, out: McapWriter, start_unix_ns: int, left_out: frozenset[st
     summary.to_session_clock(start_unix_ns)
     encoder = ChunkEncoder(ENCODINGS["raw"], out.add_chunks, start_unix_ns)
     with FileReader(path, summary=summary) as file:
-        views = ViewerTopics.of_session(file.header, left_out)
+        views = ViewerTopics(ViewerScene(camera, start_unix_ns), left_out)
         for log_ns, messages in file.new_messages(None, fields=INPUTS):
             for topic, stamp_ns, payload in views.of(messages):
                 encoder.append(topic, log_ns, Encoded(stamp_ns, None, payload))

@@ -17,8 +17,7 @@ from flowrec.store import viewer_drawings as drawings
 from flowrec.store import viewer_numbers as numbers
 from flowrec.store.codec import Payload
 from flowrec.store.schema import Schema, foxglove_schema
-from flowrec.store.session_metadata import SessionHeader
-from flowrec.store.viewer_scene import ChipCamera, ViewerScene, drawable
+from flowrec.store.viewer_scene import ViewerScene, drawable
 
 # The fields of Tick that viewer topics are made of.
 INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations"))
@@ -60,11 +59,6 @@ class ViewerTopics:
         self._goal: object = None
         self._marked: tuple[object, ...] = (None, None, None)  # route, goal and picture that were drawn last
         self._robot_ns = _NEVER
-
-    @classmethod
-    def of_session(cls, header: SessionHeader, left_out: frozenset[str]) -> ViewerTopics:
-        """Those of a session with this header."""
-        return cls(ViewerScene(ChipCamera.of(header), header.start_unix_ns), left_out)
 
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
         """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""

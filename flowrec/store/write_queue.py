@@ -1,4 +1,4 @@
-"""The queue from the control loop to the writer's thread, bounded by bytes, and which images enter it.
+"""The queue from the control loop to a recorder in a thread, bounded by bytes, and which images enter it.
 
 It has two priorities: images wait behind everything else, so that a slow disk delays no pose, and no pose is lost
 with them when the process is killed.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -37,6 +38,7 @@ class Entry(NamedTuple):
     dropped, missing : images that the writer left out, and that the camera has not delivered, since the entry before.
     window : of the image, where not all of it is recorded.
     event : in it, for which a snapshot is taken, as text; empty: none.
+    start_unix_ns : another Unix time of stamp 0 than that of the header, told with the first entry.
     """
 
     stamp_ns: int
@@ -49,6 +51,27 @@ class Entry(NamedTuple):
     missing: int = 0
     window: Window | None = None
     event: str = ""
+    start_unix_ns: int | None = None
+
+
+class End(NamedTuple):
+    """The end of a run.
+
+    Attributes
+    ----------
+    outcome, why : as of `SegmentedRun.finish`.
+    last_ns : stamp of the last tick.
+    dropped, missing, kept_every : of its images so far, as in `Drops`.
+    discard : the files of the run are removed instead.
+    """
+
+    outcome: Mapping[str, str]
+    why: str = ""
+    last_ns: int = -1
+    dropped: int = 0
+    missing: int = 0
+    kept_every: int = 1
+    discard: bool = False
 
 
 @dataclass(slots=True)
@@ -97,7 +120,9 @@ class WriteQueue:
         self._state: deque[Entry] = deque()
         self._images: deque[Entry] = deque()
         self._changed = threading.Condition()
-        self._closed = self._abandoned = False
+        self._abandoned = False
+        self.end: End | None = None
+        self.given_up = 0  # images that were removed at the end
         self._flushed_ns = -1
         self.flush_wanted = False  # a thread waits for a flush
 
@@ -143,7 +168,7 @@ class WriteQueue:
     def take(self, timeout_s: float | None) -> Entry | None:
         """The next entry; None after the timeout, when all is taken and a flush is wanted, or at the end."""
         with self._changed:
-            self._changed.wait_for(lambda: self._state or self._images or self._closed or self.flush_wanted, timeout_s)
+            self._changed.wait_for(lambda: self._state or self._images or self.end or self.flush_wanted, timeout_s)
             queue = self._state or self._images
             return queue.popleft() if queue else None
 
@@ -152,8 +177,8 @@ class WriteQueue:
         """True if the next entry may be the image of a tick that was taken before."""
         return bool(self._images)
 
-    def drop_images(self) -> int:
-        """Remove the images that wait; returns how many there were."""
+    def drop_images(self) -> None:
+        """Remove the images that wait, and count them."""
         with self._changed:
             dropped = len(self._images)
             for place, image in enumerate(self._images):
@@ -163,10 +188,10 @@ class WriteQueue:
                     others = {name: message for name, message in entry.messages.items() if name != "frame"}
                     self._state[place] = entry._replace(messages=others, dropped=entry.dropped + 1)
                     dropped += 1
-        return dropped
+            self.given_up += dropped
 
     def release(self, entry: Entry) -> None:
-        """Free the bytes of an entry that the writer's thread has handled."""
+        """Free the bytes of an entry that the recorder has handled."""
         with self._changed:
             self.nbytes -= entry.nbytes
             self._changed.notify_all()
@@ -175,22 +200,27 @@ class WriteQueue:
     def drained(self) -> bool:
         """Closed, with nothing left to take."""
         with self._changed:
-            return self._closed and not self._state and not self._images
+            return self.end is not None and not self._state and not self._images
 
-    def close(self) -> None:
-        """Nothing more will be put."""
+    def close(self, end: End) -> None:
+        """Nothing more will be put. Of a run that is discarded, what waits is not written."""
         with self._changed:
-            self._closed = True
+            self.end = end
+            if end.discard:
+                self._clear()
             self._changed.notify_all()
 
     def abandon(self) -> None:
         """Discard what waits, because the disk has failed."""
         with self._changed:
-            self._closed = self._abandoned = True
-            self._state.clear()
-            self._images.clear()
-            self.nbytes = 0
+            self._abandoned = True
+            self._clear()
             self._changed.notify_all()
+
+    def _clear(self) -> None:
+        self._state.clear()
+        self._images.clear()
+        self.nbytes = 0
 
 
 class FrameDecimation:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import operator
 import os
-import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -23,25 +20,23 @@ from flowrec.core import (
     Extra,
     Frame,
     Outcome,
-    Priority,
     SessionError,
     Tick,
     nanoseconds,
-    prioritise_thread,
-    remove_idle,
     shape_error,
 )
 from flowrec.store.channels import FRAME_PATH, codec_of_extra
 from flowrec.store.codec import codec_of, encode_record
-from flowrec.store.ring_buffer import RingBuffer, SnapshotTrigger
+from flowrec.store.recorder_process import RecorderProcess
+from flowrec.store.recording import RecorderThread, RecordingPlan
+from flowrec.store.ring_buffer import SnapshotTrigger
 from flowrec.store.roi import WindowSelector
 from flowrec.store.run_files import refuse_if_taken, run_files
-from flowrec.store.segments import Parts
 from flowrec.store.session_file import Snapshot, WriterOptions
 from flowrec.store.session_metadata import SessionHeader
-from flowrec.store.write_queue import EncodedMessages, Entry, FrameDecimation, NewMessages, WriteQueue
+from flowrec.store.viewer_scene import ChipCamera
+from flowrec.store.write_queue import EncodedMessages, End, Entry, FrameDecimation, NewMessages
 
-_NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
 _DROPS_EVERY_NS = NS_PER_S // 2
 _IMAGE_BYTES = 500  # of an image besides its pixels
 _FIELDS = tuple(topic.field for topic in TOPICS)
@@ -49,7 +44,7 @@ _messages_of: Callable[[Tick], tuple[Any, ...]] = operator.attrgetter(*_FIELDS)
 
 
 class SessionWriter:
-    """Records ticks in a new session file; `write` returns at once, a thread encodes, compresses and writes.
+    """Records ticks in a new session file; `write` returns at once, a recorder compresses and writes.
 
     Until `close` the file is named `PATH.partial`; then it gets its name in one step. A message is written in
     the first tick that holds it, with the tick's stamp as log time; the arrays of a message must not change
@@ -84,7 +79,6 @@ class SessionWriter:
     ) -> None:
         self.path = Path(path)
         self.ticks = self.dropped_frames = self.missing_frames = 0
-        self.remarks: deque[str] = deque()
         self._options = options = options or WriterOptions()
         self._block = options.block
         self._flush_ns = nanoseconds(options.flush_s)
@@ -96,51 +90,49 @@ class SessionWriter:
         self._last: tuple[Any, ...] = (None,) * len(_FIELDS)
         self._first_ns: int | None = None
         self._last_ns = -1
-        self._failure: BaseException | None = None
-        self._closed = False
+        self._closed = self._told = False
         self._extra = NO_EXTRA
         self._extra_codecs = {topic.path: codec_of_extra(topic) for topic in options.topics.extra}
         self._start_unix_ns = header.start_unix_ns
-        self._begin_unix_ns: int | None = None  # the same, where the recorder does not know it yet
         self._trigger = SnapshotTrigger(options.files) if isinstance(options.files, Snapshot) else None
         self._left_out = [topic.field for topic in options.topics.topics if topic.path in options.left_out_topics]
         refuse_if_taken(self.path, overwrite=options.overwrite, inputs=inputs)
         # Only what was there before this run may be removed after it.
-        self._replaced = {file: file.stat().st_ino for file in run_files(self.path)} if options.overwrite else {}
+        replaced = {file: file.stat().st_ino for file in run_files(self.path)} if options.overwrite else {}
         run = os.urandom(8).hex()  # the same in all files of the run, and in no other run
-        self._output: Parts | RingBuffer
-        if isinstance(options.files, Snapshot):
-            self._output = RingBuffer(self.path, header, options, options.files, run, self.remarks)
-        else:
-            self._output = Parts(self.path, header, options, options.files, run)
-        self._queue = WriteQueue(options.queue_limit_bytes)
-        self._thread = threading.Thread(target=self._work, name="session-writer", daemon=True)
-        self._thread.start()
+        plan = RecordingPlan(self.path, header, options, ChipCamera.of(header), run, replaced)
+        self._recorder: RecorderThread | RecorderProcess
+        self._recorder = RecorderProcess(plan) if options.own_process else RecorderThread(plan)
+        self._queue = self._recorder.queue
 
     @property
     def queue_bytes(self) -> int:
-        """Bytes that wait for the disk."""
+        """Bytes that wait for the recorder."""
         return self._queue.nbytes
 
     @property
     def bytes_written(self) -> int:
         """Size of the files so far."""
-        return self._output.size
+        return self._recorder.size
 
     @property
     def files(self) -> list[Path]:
-        """The complete files, in order."""
-        return list(self._output.files)
+        """The complete files, in order; those of a recorder in its own process when it has ended."""
+        return self._recorder.files
 
     @property
     def partial_path(self) -> Path:
         """The file that is written at present."""
-        return self._output.partial_path
+        return self._recorder.partial_path
+
+    @property
+    def remarks(self) -> deque[str]:
+        """Texts about snapshots, added while the run goes on."""
+        return self._recorder.remarks
 
     def prioritise(self) -> bool:
-        """Let the thread write in real time, behind a loop that has that priority too; whether it is allowed."""
-        native_id = self._thread.native_id
-        return native_id is not None and prioritise_thread(native_id, Priority.WRITER)
+        """Let the recorder write in real time, behind a loop that has that priority too; whether it is allowed."""
+        return self._recorder.prioritise()
 
     def write(self, tick: Tick) -> None:
         """Record what is new in this tick.
@@ -150,7 +142,8 @@ class SessionWriter:
         SessionError : the disk has failed, a message does not fit its declaration (both are raised by a later call
             than the one that caused them), the session is closed, or the stamp does not increase.
         """
-        self._raise_failure()
+        if self._recorder.failure is not None and self._goes_on():
+            return
         if self._closed:
             raise SessionError(f"{self.path}: the session is closed; nothing more can be written to it")
         if tick.stamp_ns <= self._last_ns:
@@ -158,9 +151,10 @@ class SessionWriter:
                 f"{self.path}: the tick at {tick.stamp_ns} ns does not come after the one at {self._last_ns} ns;"
                 " stamps of a session must grow, check the clock of the rig"
             )
+        start_unix_ns = None
         if self._first_ns is None:
             self._first_ns = tick.stamp_ns
-            self._begin_at_clocks(tick)
+            start_unix_ns = self._begin_at_clocks(tick)
         elif self._block and tick.stamp_ns - self._flush_ns >= self._first_ns:
             self._queue.wait_for_flush(min(self._last_ns, tick.stamp_ns - self._flush_ns))
             self._raise_failure()
@@ -191,11 +185,16 @@ class SessionWriter:
             missing=self.missing_frames - missing,
             window=window if self._block else None,
             event=self._trigger.event_in(tick.stamp_ns, new) if self._trigger is not None else "",
+            start_unix_ns=start_unix_ns,
         )
         if self._block and not self._queue.has_room(entry.nbytes):
             self._queue.wait_for_room(entry.nbytes)
             self._raise_failure()
-        self._queue.put(entry, image)
+        try:
+            self._queue.put(entry, image)
+        except SessionError as error:
+            self._recorder.failure = error
+            self._goes_on()
 
     def close(self, outcome: Mapping[str, str] | None = None, timeout_s: float | None = None, *, why: str = "") -> None:
         """Finish the file and give it its name; a second call does nothing.
@@ -214,17 +213,12 @@ class SessionWriter:
         if self._closed:
             return
         self._closed = True
-        self._queue.close()
-        self._thread.join(timeout_s)
-        waiting = self._queue.drop_images() if self._thread.is_alive() else 0
-        self._thread.join()
-        try:
-            if self._failure is None:
-                self._finish(outcome or {"outcome": Outcome.ENDED}, waiting, why)
-        except Exception as error:  # noqa: BLE001  raised below, as those of the thread
-            self._failure = error
-        finally:
-            self._output.close(f"{self._failure}" if self._failure is not None else "")
+        drops = self.dropped_frames, self.missing_frames, self._decimation.every
+        self._queue.close(End(dict(outcome or {"outcome": Outcome.ENDED}), why, self._last_ns, *drops))
+        if not self._recorder.wait(timeout_s):
+            self._queue.drop_images()
+            self._recorder.wait(None)
+        self.dropped_frames += self._recorder.dropped
         self._raise_failure()
 
     def discard(self) -> None:
@@ -232,12 +226,11 @@ class SessionWriter:
         if self._closed:
             return
         self._closed = True
-        self._queue.abandon()
-        self._thread.join()
-        unfinished = self.partial_path
-        self._output.close()
-        for file in (unfinished, *self.files):
-            file.unlink(missing_ok=True)
+        self._queue.close(End({}, discard=True))
+        self._recorder.wait(None)
+        if self._recorder.failure is not None:  # it has left what it had written
+            for file in (self.partial_path, *self.files):
+                file.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
@@ -325,61 +318,29 @@ class SessionWriter:
         if before != now and (due or before[1:] != now[1:]):
             new["drops"] = self._drops = Drops(stamp_ns, FRAME_PATH, *now)
 
-    def _work(self) -> None:
-        # Not in a live run: preempted by any other program, it would keep the interpreter's lock from the loop.
-        if self._block and sys.platform == "linux":  # only there has each thread a priority of its own
-            with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        try:
-            while not self._queue.drained:
-                entry = self._queue.take(self._output.timeout_s)
-                if entry is not None:
-                    if self._begin_unix_ns is not None:
-                        begin_unix_ns, self._begin_unix_ns = self._begin_unix_ns, None
-                        self._output.begin_at(begin_unix_ns)
-                    self._output.add(entry)
-                if entry is None and self._queue.flush_wanted:
-                    self._output.flush()
-                # The image of a tick comes after its other messages: where possible, whole ticks are flushed.
-                elif entry is None or "frame" in entry.messages or not self._queue.images_wait:
-                    self._output.flush_if_due()
-                if (flushed_ns := self._output.flushed_ns) is not None:
-                    self._queue.mark_flushed(flushed_ns)
-                if entry is not None:
-                    self._queue.release(entry)
-        except Exception as error:  # noqa: BLE001  `write` and `close` raise it in the control loop
-            self._failure = error
-            self._queue.abandon()
-
-    def _begin_at_clocks(self, first: Tick) -> None:
+    def _begin_at_clocks(self, first: Tick) -> int | None:
         """Let the session begin when its first tick was, by the host's clock: to prepare the run has taken a while."""
         clocks = first.clocks
-        if self._options.start_by_clocks and isinstance(clocks, Clocks):
-            self._start_unix_ns = self._begin_unix_ns = clocks.wall_ns - clocks.stamp_ns
+        if not (self._options.start_by_clocks and isinstance(clocks, Clocks)):
+            return None
+        self._start_unix_ns = clocks.wall_ns - clocks.stamp_ns
+        return self._start_unix_ns
 
-    def _finish(self, outcome: Mapping[str, str], dropped: int, why: str) -> None:
-        """Complete the output after the end of the thread; `dropped` images were left in the queue."""
-        if dropped:
-            self.dropped_frames += dropped
-            drops = Drops(self._last_ns, FRAME_PATH, self.dropped_frames, self.missing_frames, self._decimation.every)
-            self._output.add(Entry(self._last_ns, self._encode({"drops": drops}), 0))  # no other tick comes
-        self._output.finish(outcome, why)
-        if not self.files:  # what was there before may stay
-            return
-        for stale in set(run_files(self.path)) & set(self._replaced) - set(self.files):
-            if stale.stat().st_ino == self._replaced[stale]:
-                try:
-                    remove_idle(stale)  # unless another process is writing it by now
-                except OSError as error:
-                    self.remarks.append(
-                        f"{stale}: is left from an earlier run and can not be removed ({error.strerror})"
-                    )
+    def _goes_on(self) -> bool:
+        """True if the run goes on although its recorder has failed, which is told once; else the failure is raised."""
+        if not self._options.accept_losses:
+            self._raise_failure()
+        if not self._told:
+            self._told = True
+            self.remarks.append(f"{self._recorder.failure}; NOTHING IS RECORDED any more, and the run goes on")
+        return True
 
     def _raise_failure(self) -> None:
-        if isinstance(self._failure, SessionError):
-            raise SessionError(str(self._failure)) from self._failure
-        if self._failure is not None:
-            raise self._failure
+        failure = self._recorder.failure
+        if isinstance(failure, SessionError):
+            raise SessionError(str(failure)) from failure
+        if failure is not None:
+            raise failure
 
 
 def _size_of(messages: EncodedMessages) -> int:

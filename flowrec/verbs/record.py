@@ -97,7 +97,8 @@ def record(
         typer.Option(metavar="TIME[,TIME]", help="Record only the time before and after marks and alarms: 30s,10s."),
     ] = None,
     accept_losses: Annotated[
-        bool, typer.Option("--accept-losses", help="Record in real time also where images will be lost.")
+        bool,
+        typer.Option("--accept-losses", help="In real time: record also where images will be lost, or writing fails."),
     ] = False,
     movie_in_time: Annotated[bool, AS_THE_COMMAND] = False,
 ) -> "Union[Recorded, DryRun]":  # noqa: UP007 - as text

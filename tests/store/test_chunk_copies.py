@@ -18,6 +18,7 @@ from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
 from flowrec.store.session_file import SessionFile, Snapshot, Split, WriterOptions
 from flowrec.store.session_metadata import DIGEST, OUTCOME
+from flowrec.store.viewer_scene import ViewerScene
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, START_UNIX_NS, ticks_of
@@ -138,7 +139,7 @@ def test_drawings_that_are_lost_or_damaged_are_made_again_and_nothing_is_missing
 
 def test_drawings_follow_all_that_was_recorded_and_are_those_of_its_ticks(files):
     assert chunks_of(files["delta"], drawn=True)[0][0] > chunks_of(files["delta"])[-1][0]
-    views, expected = ViewerTopics.of_session(HEADER, frozenset()), {}
+    views, expected = ViewerTopics(ViewerScene(None, START_UNIX_NS)), {}
     with FileReader(files["delta"]) as file:
         for log_ns, messages in file.new_messages(None, set(file.fields.values())):
             for topic, stamp_ns, payload in views.of(messages):

@@ -219,7 +219,7 @@ def test_a_power_cut_costs_no_more_than_what_was_not_yet_kept_by_the_disk(tmp_pa
 
     def noted(self):
         # What the disk is sure to have afterwards.
-        stamp_ns, size = writer._output.flushed_ns, os.fstat(self._file.fileno()).st_size
+        stamp_ns, size = writer._recorder.recorder.flushed_ns, os.fstat(self._file.fileno()).st_size
         sync(self)
         kept.append((stamp_ns, size))
 
@@ -368,7 +368,7 @@ def test_the_operating_system_has_all_state_but_the_last_flush_s_of_stamps(tmp_p
             writer.write(tick)
             while writer.queue_bytes:
                 time.sleep(1e-4)
-            assert (writer._output.flushed_ns or ticks[0].stamp_ns) >= tick.stamp_ns - NS_PER_S // 2
+            assert (writer._recorder.recorder.flushed_ns or ticks[0].stamp_ns) >= tick.stamp_ns - NS_PER_S // 2
 
 
 def test_with_the_shipped_settings_a_power_cut_costs_a_second_on_the_slowest_disk_that_the_promise_allows(
@@ -383,7 +383,7 @@ def test_with_the_shipped_settings_a_power_cut_costs_a_second_on_the_slowest_dis
         sync(file)
 
     options = WriterOptions(flush_s=recording.flush_s, sync_s=recording.sync_s, clock=lambda: now_s[0])
-    parts = Parts(tmp_path / "s.mcap", HEADER, options, Split(), "run")
+    parts = Parts(tmp_path / "s.mcap", HEADER, options, None, Split(), "run")
     monkeypatch.setattr(McapWriter, "sync", slow)
     file = parts.open[-1].file
     kept_ns, asked, lost_s, syncs = TICKS_BEGIN_NS, None, [], 0

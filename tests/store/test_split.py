@@ -139,7 +139,7 @@ def test_a_part_whose_beginning_is_larger_than_a_part_still_gets_as_much_again(t
 
 def test_a_part_counts_the_images_that_still_wait_for_it_until_they_have_come(tmp_path):
     split = Split(megabytes=0.2)
-    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, frames="raw"), split, "run")
+    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, frames="raw"), None, split, "run")
     first = parts.open[0]
     ticks = list(ticks_of(12, shape=(200, 200)))
     image = {tick.stamp_ns: entry_of(tick.stamp_ns, tick.frame, nbytes=40_000, late=True) for tick in ticks}
@@ -307,7 +307,7 @@ def test_however_slow_the_disk_ends_a_part_a_kill_leaves_no_hole_before_the_next
 
 def test_the_operating_system_has_a_part_before_the_next_one_begins_though_images_of_it_wait(tmp_path):
     split = Split(seconds=0.3)
-    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, flush_s=100.0), split, "run")
+    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, flush_s=100.0), None, split, "run")
     for tick in TICKS[:30]:
         parts.add(entry_of(tick.stamp_ns, tick.track, nbytes=500, ticks=1, image_bytes=64))
     first, second = parts.open

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flowrec.core.system.processes import start_child
@@ -23,6 +23,10 @@ _JOIN_S = 5.0
 class ChildProcess:
     """The process, as its parent sees it; it ends with `close`, or with the parent.
 
+    Parameters
+    ----------
+    inherited : file descriptors that it gets, too.
+
     Attributes
     ----------
     process : that of the system.
@@ -33,8 +37,10 @@ class ChildProcess:
     OSError : it does not start.
     """
 
-    def __init__(self, module: str, environment: Mapping[str, str] | None = None) -> None:
-        self.process = start_child(module, environment=environment, stderr=subprocess.PIPE)
+    def __init__(
+        self, module: str, environment: Mapping[str, str] | None = None, inherited: Sequence[int] = ()
+    ) -> None:
+        self.process = start_child(module, environment=environment, stderr=subprocess.PIPE, pass_fds=inherited)
         self.printed = b""
         self._collector = threading.Thread(target=self._collect, name=module, daemon=True)
         self._collector.start()
@@ -63,6 +69,14 @@ class ChildProcess:
     def last_line(self) -> str:
         """The last line that it has printed; '' if there is none."""
         return self.printed.decode(errors="replace").strip().rpartition("\n")[2]
+
+    def finish(self) -> None:
+        """Close its stdin, and wait until it has ended by itself."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):  # the unread part of an order
+            self.process.stdin.close()
+        self.process.wait()
+        self.close()
 
     def close(self) -> None:
         """End the process at once."""

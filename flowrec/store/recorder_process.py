@@ -1,0 +1,189 @@
+"""The recorder in a process of its own: it outlives the run, and finishes the files however that has ended.
+
+The run puts entries into two rings in shared memory (shared_queue.py); the process takes them. When the process of the
+run has ended, killed or not, its pipe is closed: the recorder then writes what is left in the rings and completes the
+files. It takes no signals: Ctrl-C and a SIGTERM to all processes of a service are for the run, which ends it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any
+
+from flowrec.core import (
+    ChildProcess,
+    Priority,
+    SessionError,
+    TopicTable,
+    declaration,
+    declared_topic,
+    prioritise_thread,
+)
+from flowrec.store.recording import Recorder, RecordingPlan
+from flowrec.store.run_files import partial_path
+from flowrec.store.shared_queue import QueueReader, SharedQueue
+
+_NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
+_SILENT_S = 120.0  # without a byte written at the end of the run
+_REPORT_S = 0.2
+
+
+class RecorderProcess:
+    """The recorder's process, as the run sees it; see RecorderThread.
+
+    Raises
+    ------
+    SessionError : a file can not be made, or the process does not start.
+    """
+
+    def __init__(self, plan: RecordingPlan) -> None:
+        self.failure: BaseException | None = None
+        self.remarks: deque[str] = deque()
+        self.files: list[Path] = []
+        self.partial_path = partial_path(plan.path)
+        self.dropped = 0
+        self._ended = threading.Event()
+        try:
+            self.queue = SharedQueue(plan.options.queue_limit_bytes, images=not plan.options.block)
+            self._child = ChildProcess("flowrec.store.recorder_process", inherited=self.queue.descriptors)
+        except OSError as error:
+            raise SessionError(f"{plan.path}: its recorder does not start ({error})") from error
+        try:
+            self._child.send((_portable(plan), self.queue.handles, plan.options.block))
+            assert self._child.process.stdin is not None
+            self.queue.wake_by(self._child.process.stdin.fileno())
+            kind, reason = self._child.receive()
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            raise SessionError(f"{plan.path}: its recorder does not start ({self._cause()})") from error
+        if kind != "ready":
+            self._close()
+            raise SessionError(reason)
+        self._listener = threading.Thread(target=self._listen, name="recorder", daemon=True)
+        self._listener.start()
+
+    @property
+    def size(self) -> int:
+        """Bytes of the files so far."""
+        return self.queue.files_bytes
+
+    def prioritise(self) -> bool:
+        """Let it write in real time, behind a loop that has that priority too; whether it is allowed."""
+        return prioritise_thread(self._child.process.pid, Priority.WRITER)
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """Wait for the end of the recording; whether it has come in time."""
+        if timeout_s is not None:
+            if not self._ended.wait(timeout_s):
+                return False
+        else:
+            size = -1
+            while not self._ended.wait(_SILENT_S):
+                if size == (size := self.size):
+                    self.failure = SessionError(
+                        f"{self.partial_path}: its recorder (process {self._child.process.pid}) has written nothing"
+                        f" for {_SILENT_S:g} s; it completes the file when it can"
+                    )
+                    return True
+        self._close()
+        return True
+
+    def _listen(self) -> None:
+        """Take answers until the process has ended."""
+        try:
+            while not self._ended.is_set():
+                self._take(self._child.receive())
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+            if not self._ended.is_set():
+                self.failure = SessionError(
+                    f"{self.partial_path}: its recorder has ended ({self._cause()});"
+                    f" `flowrec recover {self.partial_path}` saves what it had written"
+                )
+        finally:
+            self._ended.set()
+            self.queue.abandon()
+
+    def _take(self, answer: tuple[str, Any]) -> None:
+        kind, value = answer
+        if kind == "remark":
+            self.remarks.append(value)
+        elif kind == "refused":
+            self.failure = SessionError(value)
+        elif kind == "failed":
+            self.failure = RuntimeError(value)
+        else:
+            self.files, self.partial_path, self.dropped, failed = value
+            if failed is not None:
+                self._take(failed)
+            self._ended.set()
+
+    def _cause(self) -> str:
+        last = self._child.last_line
+        return self._child.cause() + (f": {last[:300]}" if last else "")
+
+    def _close(self) -> None:
+        """The process ends by itself, when its pipe is closed."""
+        self._child.finish()
+        self.queue.close()
+
+
+def _portable(plan: RecordingPlan) -> tuple[RecordingPlan, list[tuple[str, str]]]:
+    """The plan without topics of packages, and their declarations: the recorder imports no package."""
+    topics = [(topic.path, declaration(topic)) for topic in plan.options.topics.extra]
+    return replace(plan, options=replace(plan.options, topics=TopicTable(()))), topics
+
+
+def _work() -> None:
+    """Record one run: the process."""
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, signal.SIG_IGN)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what is printed does not get between the answers
+    (plan, topics), handles, low = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+    table = TopicTable(declared_topic(path, text) for path, text in topics)
+    plan = replace(plan, options=replace(plan.options, topics=table))
+    if low and sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+    queue = QueueReader(handles, sys.stdin.fileno())
+    try:
+        recorder = Recorder(plan, lambda text: _answer(answers, "remark", text))
+    except SessionError as error:
+        _answer(answers, "refused", str(error))
+        return
+    _answer(answers, "ready", None)
+    failed: tuple[str, str] | None = None
+    try:
+        threading.Thread(target=_work_beside, args=(recorder, queue), daemon=True).start()
+        recorder.record(queue)
+    except SessionError as error:
+        failed = "refused", str(error)
+    except Exception as error:  # noqa: BLE001  the run raises it
+        failed = "failed", f"{type(error).__name__}: {error}"
+    _answer(answers, "ended", (recorder.files, recorder.partial_path, recorder.dropped, failed))
+
+
+def _work_beside(recorder: Recorder, queue: QueueReader) -> None:
+    """Load what draws the file, which takes a second, before the run has ended; tell the size of the files."""
+    from flowrec.physics import sample  # noqa: F401
+
+    while True:
+        queue.note_files_bytes(recorder.size)
+        time.sleep(_REPORT_S)
+
+
+def _answer(answers: IO[bytes], kind: str, value: object) -> None:
+    with contextlib.suppress(BrokenPipeError):  # the run has ended: nobody asks
+        answers.write(pickle.dumps((kind, value)))
+        answers.flush()
+
+
+if __name__ == "__main__":
+    _work()

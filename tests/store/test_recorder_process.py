@@ -1,0 +1,210 @@
+"""The recorder in a process of its own: the run, the recorder or both are killed, stopped, or meet a bad disk."""
+
+import itertools
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import OperatorEvent
+from flowrec.core.units import NS_PER_S
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
+from flowrec.store.run_files import files_of
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.writer import SessionWriter
+from tests.conftest import HANG_S, until
+from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
+from tests.store.test_chunk_copies import messages_of
+from tests.store.test_declared_topics import TOPICS, same_extra, sent_ticks
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="descriptors are inherited by POSIX processes only")
+OWN = WriterOptions(own_process=True, block=True, frames="raw")
+TICKS = list(ticks_of(60))
+
+
+def record(path, options=OWN, ticks=TICKS):
+    with SessionWriter(path, HEADER, options) as writer:
+        for tick in ticks:
+            writer.write(tick)
+        writer.close({"outcome": "reached"})
+    return writer
+
+
+def write_all(writer, ticks):
+    for tick in ticks:
+        writer.write(tick)
+        time.sleep(0.002)
+
+
+def recorder_of(writer: SessionWriter) -> int:
+    return writer._recorder._child.process.pid
+
+
+@pytest.mark.parametrize("block", [True, False])
+def test_a_process_writes_the_messages_that_a_thread_writes(tmp_path, block):
+    for name, own in (("process", True), ("thread", False)):
+        record(tmp_path / f"{name}.mcap", replace(OWN, own_process=own, block=block))
+    assert messages_of(tmp_path / "process.mcap") == messages_of(tmp_path / "thread.mcap")
+    with SessionReader(tmp_path / "process.mcap") as file:
+        assert file.header == HEADER and file.outcome == {"outcome": "reached", "ticks": "60", "dropped_frames": "0"}
+
+
+def test_parts_snapshots_and_declared_topics_pass_through_a_process(tmp_path):
+    parts = record(tmp_path / "p.mcap", replace(OWN, files=Split(seconds=0.3)))
+    assert len(parts.files) == 4 and files_of(tmp_path / "p.mcap") == parts.files
+    marked = replace(TICKS[40], operator=OperatorEvent(TICKS[40].stamp_ns, "mark", "here"))
+    ring = record(tmp_path / "r.mcap", replace(OWN, files=Snapshot(0.2, 0.1)), [*TICKS[:40], marked, *TICKS[41:]])
+    assert "mark: here" in [SessionReader(file).part.why for file in ring.files]
+    assert any("whole" in text for text in ring.remarks)
+    ticks = list(sent_ticks())
+    record(tmp_path / "e.mcap", replace(OWN, topics=TOPICS), ticks)
+    read = list(SessionReader(tmp_path / "e.mcap").ticks())
+    assert len(read) == len(ticks) and all(same_extra(one, other) for one, other in zip(ticks, read, strict=True))
+
+
+def test_what_can_not_be_made_is_refused_before_the_run_and_a_discarded_run_leaves_no_file(tmp_path):
+    with pytest.raises(SessionError, match="no such directory"):
+        SessionWriter(tmp_path / "nowhere" / "x.mcap", HEADER, OWN)
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, OWN)
+    writer.write(TICKS[0])
+    writer.discard()
+    assert list(tmp_path.iterdir()) == []
+
+
+RUN = """
+import sys, time
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.writer import SessionWriter
+from tests.store.made_up import HEADER, ticks_of
+options, pause_s, side = eval(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
+writer = SessionWriter(sys.argv[1], HEADER, options)
+print(writer._recorder._child.process.pid, flush=True)
+for number, tick in enumerate(ticks_of(100_000, shape=(side, side))):
+    writer.write(tick)
+    print(number, flush=True)
+    time.sleep(pause_s)
+"""
+
+
+def started(path, options, pause_s=0.002, side=64):
+    words = [sys.executable, "-c", RUN, path, options, str(pause_s), str(side)]
+    run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    return run, int(run.stdout.readline())
+
+
+def written_by(run, ticks):
+    """Wait for so many ticks; then the number of the last one that was told."""
+    for line in run.stdout:
+        if int(line) >= ticks:
+            return int(line)
+    raise AssertionError("the run has ended")
+
+
+def last_told(run, number):
+    """The last tick that a run has told before it was killed, after `number`."""
+    return max([number, *(int(line) for line in run.stdout.read().split("\n")[:-1])])
+
+
+KINDS = {
+    "faster than real time": ("WriterOptions(own_process=True, block=True)", 0.0, 64),
+    "live": ("WriterOptions(own_process=True)", 0.002, 64),
+    "large": ("WriterOptions(own_process=True, frames='raw')", 0.02, 2000),
+    "parts": ("WriterOptions(own_process=True, files=Split(seconds=0.5))", 0.002, 64),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_a_run_that_is_killed_every_tick_that_it_handed_over_is_in_a_complete_session(tmp_path, kind):
+    path = tmp_path / "x.mcap"
+    run, _ = started(path, *KINDS[kind])
+    number = written_by(run, 60)
+    run.kill()
+    run.wait(HANG_S)
+    number = last_told(run, number)
+    run.stdout.close()
+    until(lambda: not list(tmp_path.glob("*.partial")))
+    ticks = [tick.stamp_ns for tick in SessionReader(path).ticks()]
+    begin_ns = next(ticks_of(1)).stamp_ns
+    assert ticks == [begin_ns + each * PERIOD_NS for each in range(len(ticks))]
+    assert len(ticks) in (number + 1, number + 2)  # it may have been killed between handing over and telling
+    with SessionReader(path) as file:
+        assert file.outcome["outcome"] == "failed" and "its recorder has completed it" in file.outcome["note"]
+        assert file.counts["frame"] == len(ticks)
+
+
+def test_the_kill_of_a_recorder_is_told_at_once_and_costs_half_a_second(tmp_path):
+    path = tmp_path / "x.mcap"
+    writer = SessionWriter(path, HEADER, WriterOptions(own_process=True))
+    began_s, ticks = time.monotonic(), ticks_of(100_000, shape=(64, 64))
+    for number, tick in enumerate(ticks):
+        writer.write(tick)
+        time.sleep(max(0.0, began_s + number * PERIOD_NS / NS_PER_S - time.monotonic()))
+        if number == 90:
+            break
+    os.kill(recorder_of(writer), signal.SIGKILL)
+    with pytest.raises(SessionError, match=r"its recorder has ended \(killed by SIGKILL\); `flowrec recover "):
+        write_all(writer, itertools.islice(ticks, 500))
+    with pytest.raises(SessionError, match="its recorder has ended"):
+        writer.close()
+    saved = list(SessionReader(recover(path.with_name("x.mcap.partial")).path).ticks())
+    assert (91 - len(saved)) * PERIOD_NS < 0.5 * NS_PER_S
+
+
+def test_a_run_that_accepts_losses_goes_on_without_its_recorder_says_so_once_and_does_not_end_well(tmp_path):
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(own_process=True, accept_losses=True))
+    ticks = ticks_of(400)
+    write_all(writer, itertools.islice(ticks, 20))
+    os.kill(recorder_of(writer), signal.SIGKILL)
+    write_all(writer, ticks)
+    (remark,) = writer.remarks
+    assert "killed by SIGKILL" in remark and "NOTHING IS RECORDED" in remark
+    with pytest.raises(SessionError, match="its recorder has ended"):
+        writer.close()
+
+
+def test_a_recorder_that_stands_still_costs_no_tick_and_delays_no_write(tmp_path):
+    options = WriterOptions(own_process=True, frames="raw", queue_limit_bytes=1 << 20)
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, options)
+    os.kill(recorder_of(writer), signal.SIGSTOP)
+    longest_s = 0.0
+    for tick in ticks_of(300, shape=(128, 128)):  # 5 MB
+        began_s = time.process_time()
+        writer.write(tick)
+        longest_s = max(longest_s, time.process_time() - began_s)
+    os.kill(recorder_of(writer), signal.SIGCONT)
+    writer.close()
+    with SessionReader(tmp_path / "x.mcap") as file:
+        assert file.counts["track"] == 300 and file.counts["frame"] == 300 - writer.dropped_frames
+        assert 50 < writer.dropped_frames < 300 == int(file.outcome["ticks"])
+    assert longest_s < 0.1  # of CPU time: it has not waited for room in a loop
+
+
+def test_a_disk_that_is_full_ends_the_run_with_its_reason_and_what_was_written_is_recovered(tmp_path):
+    path = tmp_path / "x.mcap"
+    writer = SessionWriter(path, HEADER, WriterOptions(own_process=True, flush_s=0.05))
+    resource.prlimit(recorder_of(writer), resource.RLIMIT_FSIZE, (200_000, 200_000))
+    with pytest.raises(SessionError, match=r"x\.mcap\.partial: writing failed \(File too large\)"):
+        write_all(writer, ticks_of(100_000))
+    with pytest.raises(SessionError, match="File too large"):
+        writer.close()
+    assert recover(writer.partial_path).ticks > 10
+
+
+def test_a_run_whose_images_are_given_up_counts_them(tmp_path):
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(own_process=True, frames="raw"))
+    os.kill(recorder_of(writer), signal.SIGSTOP)
+    for tick in TICKS:
+        writer.write(tick)
+    timer = subprocess.Popen(["sh", "-c", f"sleep 0.5; kill -CONT {recorder_of(writer)}"])
+    writer.close(timeout_s=0.05)
+    timer.wait()
+    with SessionReader(tmp_path / "x.mcap") as file:
+        assert writer.dropped_frames == 60 and file.counts.get("frame", 0) == 0 and file.counts["track"] == 60
+        assert file.outcome["dropped_frames"] == "60" and list(file.messages("drops"))[-1].by_backlog == 60
