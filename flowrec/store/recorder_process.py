@@ -32,6 +32,7 @@ from flowrec.store.recording import Recorder, RecordingPlan
 from flowrec.store.run_files import partial_path
 from flowrec.store.shared_queue import QueueReader, SharedQueue
 
+MODULE = "flowrec.store.recorder_process"  # its process is known by its words: this, and the path of the session
 _NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
 _SILENT_S = 120.0  # without a byte written at the end of the run
 _REPORT_S = 0.2
@@ -54,7 +55,7 @@ class RecorderProcess:
         self._ended = threading.Event()
         try:
             self.queue = SharedQueue(plan.options.queue_limit_bytes, images=not plan.options.block)
-            self._child = ChildProcess("flowrec.store.recorder_process", inherited=self.queue.descriptors)
+            self._child = ChildProcess(MODULE, str(plan.path.absolute()), inherited=self.queue.descriptors)
         except OSError as error:
             raise SessionError(f"{plan.path}: its recorder does not start ({error})") from error
         try:

@@ -65,7 +65,7 @@ class Scan:
     chunks_passed : that were not read, because only the declarations were wanted.
     """
 
-    _source: McapReader
+    source: McapReader
     _visit: Visit | None = None
     _start_unix_ns: int | None = None  # as the index has it; None: no digests are wanted
     summary: Summary = field(default_factory=Summary)
@@ -82,7 +82,7 @@ class Scan:
 
     def add(self, opcode: int, offset: int, length: int) -> bool:
         """Enter one record; False when it is damaged."""
-        source = self._source
+        source = self.source
         try:
             if opcode == Opcode.CHUNK:
                 self._add_chunk(offset, length)
@@ -114,8 +114,8 @@ class Scan:
         summary.count(self.counts, len(summary.chunks), first_ns, last_ns)
 
     def _add_chunk(self, offset: int, length: int) -> None:
-        content = self._source.content(offset, length)
-        records = self._source.messages_in(content, offset)
+        content = self.source.content(offset, length)
+        records = self.source.messages_in(content, offset)
         if not records:
             return
         place = ChunkIndex(
@@ -175,7 +175,7 @@ def scan(
     while at < source.size:
         if progress is not None:
             progress(at)
-        opcode, end = _extent(source, at)
+        opcode, end = extent_of(source, at)
         declared += opcode in _DECLARING
         if declared > _TIMES_DECLARED * DECLARED_LIMIT:
             raise source.damage_error(at, f"more than {_TIMES_DECLARED * DECLARED_LIMIT} records besides chunks")
@@ -193,7 +193,7 @@ def scan(
             found.lose(at, source.size - at)
             break
         # A damaged record between intact ones is skipped; else its length is not to be trusted either.
-        length_is_sound = end and (end == source.size or _extent(source, end)[1])
+        length_is_sound = end and (end == source.size or extent_of(source, end)[1])
         following = end if length_is_sound else _next_chunk(source, at + 1)
         found.lose(at, following - at)
         at = following
@@ -201,7 +201,7 @@ def scan(
     return found
 
 
-def _extent(source: McapReader, at: int) -> tuple[int, int]:
+def extent_of(source: McapReader, at: int) -> tuple[int, int]:
     """Opcode and end of the record at an offset; the end is 0 where no whole record can be."""
     if at + RECORD_HEAD.size > source.size:
         return 0, 0

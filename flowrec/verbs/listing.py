@@ -113,7 +113,8 @@ def describe(path: Path, files: Sequence[Path], name: str) -> tuple[ListedSessio
         unfinished = any(file.name.endswith(PARTIAL_SUFFIX) for file in files)
         what = "recording" if any(map(is_growing, files)) else "unfinished" if unfinished else "unreadable"
         parts = len(files) if list(files) != [path] else 0
-        return ListedSession(name, what, str(error).removeprefix(f"{path}: "), size, parts=parts), error
+        why = str(error).removeprefix(f"{path}: ") if what != "recording" else "`flowrec view --live` shows it"
+        return ListedSession(name, what, why, size, parts=parts), error
     return row, session
 
 

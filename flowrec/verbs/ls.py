@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from flowrec.core import UsageError
 from flowrec.store import session_path
 from flowrec.verbs.command import verb
 from flowrec.verbs.listed import ListedSession, columns_for_people, is_doubtful
@@ -24,6 +25,9 @@ class Listing(list[ListedSession]):
         """Print the rows as a table, and why some can not be read."""
         from flowrec.core import say, table, width
 
+        if not self.places:
+            say("no run is being recorded")
+            return
         doubtful = [number for number, row in enumerate(self) if is_doubtful(row)]
         title = ", ".join(map(str, self.places))
         table(title, *columns_for_people(self, width()), text="notes", amber=doubtful)
@@ -34,6 +38,7 @@ class Listing(list[ListedSession]):
 
 @verb(
     "flowrec ls runs",
+    "flowrec ls --live",
     "flowrec ls s3://lab/runs/",
     'flowrec ls runs/*.mcap --where "refined_flow_error < 0.05" --sort -duration_s',
 )
@@ -49,6 +54,7 @@ def ls(
         str, typer.Option(metavar="SQL", help="Only sessions for which this holds, of the facts of flowrec info.")
     ] = "",
     sort: Annotated[str, typer.Option(metavar="FACT", help="Sort by this fact; -FACT: the largest first.")] = "",
+    live: Annotated[bool, typer.Option("--live", help="Those that are being recorded on this machine.")] = False,
 ) -> Listing:
     """List sessions, unfinished and unreadable ones included.
 
@@ -59,11 +65,18 @@ def ls(
     Raises
     ------
     SessionError : there is no such folder or file.
-    UsageError : the expression is not valid, or names a fact that no session has; DuckDB is not installed.
+    UsageError : the expression is not valid, or names a fact that no session has; DuckDB is not installed; `live` goes
+        with no place.
     """
     from flowrec.verbs.listing import list_sessions
 
-    places = [session_path(place) for place in places or [Path()]]
+    if live:
+        if places:
+            raise UsageError(f"{places[0]}: --live lists the runs of this machine, wherever they are")
+        from flowrec.store import live_runs
+
+        places = [run.path for run in live_runs()]
+    places = [session_path(place) for place in places or ([] if live else [Path()])]
     listing = Listing(list_sessions(places, where, sort))
     listing.places = places
     return listing

@@ -15,9 +15,12 @@ from flowrec.verbs.options import Overwrite
     "flowrec view a.mcap",
     "flowrec view a.mcap --screenshot a.png --time 12",
     "flowrec view a.mcap --layout .",
+    "flowrec view --live",
 )
 def view(
-    session: Annotated[Path, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd).")],
+    session: Annotated[
+        Path | None, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd); with --live a run.")
+    ] = None,
     beside: Annotated[
         Path | None, typer.Argument(metavar="[OTHER]", help="Another session of the same chip, in the same view.")
     ] = None,
@@ -41,13 +44,16 @@ def view(
         ),
     ] = None,
     no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="Show a run that is being recorded; the only one need not be named.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> Told:
-    """Write the .rrd of a session and open it in Rerun.
+    """Write the .rrd of a session and open it in Rerun, or show a run that is being recorded.
 
     Raises
     ------
-    UsageError : outputs that do not go together.
+    UsageError : outputs that do not go together; no session is named, or with `live` not one of several runs.
     SessionError : the session can not be read, or an output not be written; OutputError if it may not be.
     """
     from flowrec.core import PICTURE, Output
@@ -55,6 +61,14 @@ def view(
     from flowrec.view import open_viewer
     from flowrec.view import screenshot as take
 
+    if live:
+        if any(value is not None for value in (beside, out, screenshot, time, layout)):
+            raise UsageError("--live: shows a run that is being recorded, and writes no file")
+        from flowrec.verbs.watching import watch
+
+        return Told(after=lambda: watch(session, "serve" if no_open else "spawn"))
+    if session is None:
+        raise UsageError("SESSION: name a session (.mcap), or --live for a run that is being recorded")
     if session.suffix == ".rrd" and not session.exists():
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     if beside is not None and ".rrd" in (session.suffix, beside.suffix):
@@ -62,11 +76,7 @@ def view(
     if layout is not None:
         if session.suffix == ".rrd" or any(value is not None for value in (beside, out, screenshot, time)):
             raise UsageError(f"--layout {layout}: is for one session (.mcap) and goes with no other output")
-        from flowrec.exports import write_layouts
-
-        made = write_layouts(session, layout, overwrite)
-        found = {"session": session, "foxglove": made.foxglove, "rerun": made.rerun}
-        return Told(lambda: {key: str(path) for key, path in found.items()}, remarks=lambda: made.advice)
+        return _write_layouts(session, layout, overwrite)
     if screenshot is not None:
         Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
     rrd = session if session.suffix == ".rrd" else export(session, out, overwrite, beside=beside)
@@ -76,3 +86,11 @@ def view(
     elif not no_open:
         told += filter(None, [open_viewer(rrd)])
     return Told(lambda: export_json(session, rrd), remarks=lambda: told)
+
+
+def _write_layouts(session: Path, folder: Path, overwrite: bool) -> Told:
+    from flowrec.exports import write_layouts
+
+    made = write_layouts(session, folder, overwrite)
+    found = {"session": session, "foxglove": made.foxglove, "rerun": made.rerun}
+    return Told(lambda: {key: str(path) for key, path in found.items()}, remarks=lambda: made.advice)

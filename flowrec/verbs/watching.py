@@ -1,14 +1,17 @@
-"""Displays of a run while it is recorded: the live view in Rerun, and the console in a browser."""
+"""Displays of a run while it is recorded: the live view in Rerun, and the console in a browser.
+
+The run itself hands its ticks over to them, or another process reads them from its file (`watch`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from flowrec.console import Console, RunEnded
-from flowrec.core import FlowrecError, View, say
+from flowrec.core import FlowrecError, UsageError, View, say, seconds
 from flowrec.physics import Chip
 from flowrec.run import RunControl, Sink
 from flowrec.stages import Pipeline, ResolvedConfig
@@ -78,3 +81,36 @@ class Watching:
 
     def __exit__(self, _kind: object, error: BaseException | None, _traceback: object) -> None:
         self.close(RunEnded(f"failed: {error}" if isinstance(error, FlowrecError) else "failed"))
+
+
+def watch(path: Path | None, mode: Literal["spawn", "serve"]) -> None:
+    """Show a run that another process records, from the beginning of its file until it ends or Ctrl-C.
+
+    Raises
+    ------
+    UsageError : no run is named, and there is not exactly one.
+    SessionError : it is not being recorded, or its file is damaged.
+    """
+    from flowrec.exports import scene_of
+    from flowrec.stages import assemble
+    from flowrec.store import GrowingRun, live_runs
+    from flowrec.view import LiveView
+
+    if path is None:
+        runs = live_runs()
+        if len(runs) != 1:
+            there = ": name one of " + ", ".join(str(run.path) for run in runs) if runs else ""
+            raise UsageError(f"--live: {len(runs) or 'no'} runs are being recorded{there}")
+        path = runs[0].path
+    run = GrowingRun(path)
+    scene = scene_of(run.config, run.chip, assemble(run.config, run.chip), run.path)
+    last_ns = 0
+    with LiveView(scene, mode) as shown:
+        say(f"{run.path}: Ctrl-C ends the view, not the run")
+        say(shown.message)
+        for tick in run.ticks():
+            shown.write(tick)
+            last_ns = tick.stamp_ns
+    say(f"{run.path}: the run has ended at {seconds(last_ns):.1f} s")
+    if shown.afterwards:
+        say(shown.afterwards)

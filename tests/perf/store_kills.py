@@ -1,4 +1,4 @@
-"""kill -9 at random moments of a recording, and what `recover` restores."""
+"""kill -9 at random moments of a recording, of the run, its recorder or both, and what is left or restored."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ from tests.perf.store_writers import made_up_header, pictures, ticks_of
 _SHORTEST_S, _LONGEST_S = 0.1, 2.5
 _PART_S = 0.4
 _FLUSH_S = 0.5
-_HANDED = struct.Struct("<QQ")  # stamp of the last tick that was handed over, ns, and how many were
+_HANDED = struct.Struct("<QQQ")  # stamp of the last tick that was handed over, ns; how many were; the recorder's pid
+_VICTIMS = ("run", "recorder", "both")
+_END_S = 60.0  # for the recorder to complete the file
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ class Kind:
     mark_every: int = 0  # ticks
     state_s: float = _FLUSH_S
     images_s: float = _FLUSH_S
+    victim: str = "run"
 
 
 @dataclass(slots=True)
@@ -64,20 +67,27 @@ class _Found:
 
 
 def _kinds(split_s: float) -> tuple[Kind, ...]:
-    return (
+    kinds = (
         Kind("real time"),
         Kind("faster than real time", realtime=False, rate_hz=60.0),
-        # Images wait for a slow disk for up to 2 s, as with `recording.queue_mb` left alone.
-        Kind("2448x2048 at 20 Hz", 2448, 2048, 20.0, "zstd", images_s=2.0 + _FLUSH_S),
+        # Images wait for a slow disk for up to 4 s, as with `recording.queue_mb` left alone.
+        Kind("2448x2048 at 20 Hz", 2448, 2048, 20.0, "zstd", images_s=4.0 + _FLUSH_S),
         Kind(f"parts of {split_s:g} s", pieces=Split(seconds=split_s)),
         Kind("ring, from a mark on", pieces=Snapshot(2.0, 60.0), mark_every=10**6),
+    )
+    nothing = {"state_s": 0.0, "images_s": 0.0}  # is lost of a run whose recorder lives
+    return tuple(
+        replace(kind, name=f"{kind.name}: {victim}", victim=victim, **(nothing if victim == "run" else {}))
+        for victim in _VICTIMS
+        for kind in kinds
     )
 
 
 def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[str, Any]:
     """Loss per kill, in s of stamps: from the last tick handed over to the last one recovered.
 
-    `count` kills of each kind. Every recovered session is read from end to end and recovered once more, which must
+    `count` kills of each kind, of the run, of its recorder and of both. A recorder that lives completes the file.
+    Every recovered session is read from end to end and recovered once more, which must
     change nothing. Runs that were killed before the first flush may have nothing to be saved; their length is no loss
     of more than that. In parts, the finished ones must be whole, and no tick may be missing between.
     """
@@ -133,10 +143,17 @@ def _kill(kind: Kind, images: list[Image], path: Path, after_s: float, found: _F
         while not _HANDED.unpack_from(handed)[1]:
             time.sleep(0.001)
         time.sleep(after_s)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        handed_ns, _ = _HANDED.unpack_from(handed)
+        _, _, recorder = _HANDED.unpack_from(handed)
+        for process in {"run": (child,), "recorder": (recorder,), "both": (child, recorder)}[kind.victim]:
+            os.kill(process, signal.SIGKILL)
+        os.waitpid(child, 0)  # a run whose recorder has ended ends, too
+        handed_ns, _, _ = _HANDED.unpack_from(handed)
+    end_s = time.monotonic() + _END_S
+    while Path(f"/proc/{recorder}").exists() and time.monotonic() < end_s:
+        time.sleep(0.01)
     found.kills += 1
+    if kind.victim == "run" and list(path.parent.glob(f"*{PARTIAL_SUFFIX}")):
+        found.faults.append("the recorder has left an incomplete file")
     left = run_files(path)
     found.files += len(left)
     state: list[tuple[int, int]] = []  # number of the tick and its stamp
@@ -163,6 +180,7 @@ def _kill(kind: Kind, images: list[Image], path: Path, after_s: float, found: _F
     if state:  # else the whole run, which was short
         found.state_s.append(seconds(handed_ns - state[-1][1]))
         found.images_s.append(seconds(handed_ns - frame_ns))
+        # A run may be killed between handing over and noting that; then more is recorded than it knows.
         if found.state_s[-1] > kind.state_s or found.images_s[-1] > kind.images_s:
             found.faults.append(f"more than stated is lost: {found.state_s[-1]:.2f} s, {found.images_s[-1]:.2f} s")
     found.before_the_first_flush += not state
@@ -200,13 +218,15 @@ def _spread(lost_s: list[float]) -> dict[str, float]:
 def _record(kind: Kind, path: Path, images: list[Image], handed: mmap.mmap) -> None:
     """Record until the process is killed. In real time, stamps are those of the monotonic clock."""
     options = WriterOptions(frames=kind.frames, flush_s=_FLUSH_S, block=not kind.realtime, files=kind.pieces)
+    options = replace(options, own_process=True)
     with SessionWriter(path, made_up_header(), options) as writer:
+        recorder = writer._recorder._child.process.pid
         for number, made in enumerate(ticks_of(images, 10**6, kind.rate_hz)):
             tick = _at(made, time.monotonic_ns()) if kind.realtime else made
             if kind.mark_every and number % kind.mark_every == 0:
                 tick = replace(tick, operator=OperatorEvent(tick.stamp_ns, "mark", ""))
             writer.write(tick)
-            _HANDED.pack_into(handed, 0, tick.stamp_ns, number + 1)
+            _HANDED.pack_into(handed, 0, tick.stamp_ns, number + 1, recorder)
             if kind.realtime:
                 time.sleep(1.0 / kind.rate_hz)
 

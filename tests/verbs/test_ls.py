@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -12,11 +14,13 @@ from typer.testing import CliRunner, Result
 
 from flowrec.core.errors import SessionError, UsageError
 from flowrec.store.notes import notes_file
+from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.cli import app
 from flowrec.verbs.listing import read_each
 from flowrec.verbs.ls import ls
+from flowrec.verbs.view import view as view_session
 from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
 
@@ -65,6 +69,31 @@ def test_a_run_that_is_going_on_is_listed_as_such(tmp_path: Path) -> None:
             writer.write(tick)
         assert [row.outcome for row in ls([tmp_path])] == ["recording"]
     assert [row.outcome for row in ls([tmp_path])] == ["ended"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="descriptors are inherited by POSIX processes only")
+def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    recorded = SessionReader(session)
+    with SessionWriter(path, recorded.header, WriterOptions(own_process=True, block=True, flush_s=0.05)) as writer:
+        for tick in itertools.islice(recorded.ticks(), 100):
+            writer.write(tick)
+        shown = typed("ls", "--live").stdout
+        assert "x.mcap.partial" in shown and "recording" in shown
+        words = [sys.executable, "-m", "flowrec", "view", path, "--live", "--no-open"]
+        with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as view:
+            assert view.stderr is not None
+            told = [view.stderr.readline() for _ in range(2)]
+            assert "Ctrl-C ends the view" in told[0] and "rerun --connect" in told[1]
+            writer.close()
+            last = view.stderr.read()
+    assert view.returncode == 0 and f"the run has ended at {tick.stamp_ns / 1e9:.1f} s" in last
+    with pytest.raises(SessionError, match="is not being recorded"):
+        typed("view", path, "--live")
+    with pytest.raises(UsageError, match="name a session"):
+        view_session(None)
+    with pytest.raises(UsageError, match="writes no file"):
+        view_session(None, live=True, out=tmp_path / "x.rrd")
 
 
 def test_listing_reads_no_messages(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

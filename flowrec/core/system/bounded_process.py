@@ -82,7 +82,7 @@ class BoundedProcess:
     def _start_child(self) -> ChildProcess:
         try:
             one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-            return ChildProcess("flowrec.core.system.bounded_process", one_thread)
+            return ChildProcess("flowrec.core.system.bounded_process", environment=one_thread)
         except OSError as error:
             raise self._error(f"{self._where}: no process starts to read it ({error.strerror or error})") from error
 

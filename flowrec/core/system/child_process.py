@@ -38,9 +38,13 @@ class ChildProcess:
     """
 
     def __init__(
-        self, module: str, environment: Mapping[str, str] | None = None, inherited: Sequence[int] = ()
+        self,
+        module: str,
+        *words: str,
+        environment: Mapping[str, str] | None = None,
+        inherited: Sequence[int] = (),
     ) -> None:
-        self.process = start_child(module, environment=environment, stderr=subprocess.PIPE, pass_fds=inherited)
+        self.process = start_child(module, *words, environment=environment, stderr=subprocess.PIPE, pass_fds=inherited)
         self.printed = b""
         self._collector = threading.Thread(target=self._collect, name=module, daemon=True)
         self._collector.start()
