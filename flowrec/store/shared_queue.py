@@ -22,9 +22,12 @@ from flowrec.store.codec import Encoded
 from flowrec.store.write_queue import End, Entry
 
 _STATE_BYTES = 160 << 20  # twice a tick of 80 MB, which always has room in an empty ring
-_IMAGE_BYTES = 64 << 20  # besides the limit, for the same reason
+# Besides the limit, for the same reason, and so that the image that was taken last stays in its place while all that
+# may wait is put in: it may become the first one of the next part.
+_IMAGE_BYTES = 64 << 20
 _MARGIN_BYTES = 1 << 20
 _POLL_S = 0.0005
+_PARENT_S = 1.0
 _HEAD = struct.Struct("<I")
 _FLUSHED, _WANTED, _DROP, _FILES = range(4)  # words of the ring of the state
 
@@ -156,14 +159,14 @@ class QueueReader:
     Parameters
     ----------
     handles : of the rings.
-    pipe : by which the run wakes this process; it is closed when the run has ended.
+    pipe : by which the run wakes this process; it is closed when the run has ended, unless that was forked.
     """
 
     def __init__(self, handles: list[tuple[int, str]], pipe: int) -> None:
         self._rings = [SharedRing(nbytes, handle=handle) for nbytes, handle in handles]
         self._words, self._pipe = self._rings[0].words, pipe
         self._taken_from = self._rings[0]
-        self._alive = True
+        self._alive, self._parent = True, os.getppid()
         self._last_ns = 0
         self.end: End | None = None
         self.given_up = 0
@@ -193,9 +196,9 @@ class QueueReader:
         if entry is not None or self.end is not None or self.flush_wanted:
             return entry
         if self._alive:
-            ready, _, _ = select.select([self._pipe], [], [], timeout_s)
-            if ready and not os.read(self._pipe, 1 << 16):
-                self._alive = False  # after this nothing more can come
+            ready, _, _ = select.select([self._pipe], [], [], _PARENT_S if timeout_s is None else timeout_s)
+            closed = bool(ready) and not os.read(self._pipe, 1 << 16)
+            self._alive = not closed and os.getppid() == self._parent  # else nothing more can come
         entry = self._next()
         if entry is None and not self._alive and self.end is None:
             note = f"the process of the run ended without closing the file, at {seconds(self._last_ns):.3f} s"
@@ -217,7 +220,7 @@ class QueueReader:
             if record is None:
                 continue
             self._taken_from = ring
-            found = _content_of(record)
+            found = _content_of(record, copied=ring is self._rings[0] or len(record) > _IMAGE_BYTES)
             if isinstance(found, End):
                 self.end = found
                 ring.release()
@@ -247,8 +250,8 @@ def _record_of(entry: Entry) -> tuple[bytes | memoryview, ...]:
     return _HEAD.pack(len(head)), head, *parts
 
 
-def _content_of(record: memoryview) -> Entry | End:
-    """Its inverse. Payloads are copied, because the recorder keeps the latest of each topic; pixels are not."""
+def _content_of(record: memoryview, *, copied: bool) -> Entry | End:
+    """Its inverse. Payloads are copied, because the recorder keeps the latest of each topic; pixels are on demand."""
     (length,) = _HEAD.unpack_from(record)
     at = _HEAD.size
     if not length:
@@ -261,7 +264,7 @@ def _content_of(record: memoryview) -> Entry | End:
         if len(rest) == 2:
             bits, shape = rest
             image = np.frombuffer(record, pixel_type(bits), shape[0] * shape[1], at).reshape(shape)
-            entry.messages[field] = Frame(stamp_ns, number, image, bits)
+            entry.messages[field] = Frame(stamp_ns, number, image.copy() if copied else image, bits)
             at += image.nbytes
         else:
             entry.messages[field] = Encoded(stamp_ns, number, (bytes(record[at : at + rest[0]]),))

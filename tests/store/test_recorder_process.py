@@ -9,11 +9,13 @@ import sys
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from flowrec.core.errors import SessionError
 from flowrec.core.messages import OperatorEvent
 from flowrec.core.units import NS_PER_S
+from flowrec.store import shared_queue
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.run_files import files_of
@@ -69,6 +71,24 @@ def test_parts_snapshots_and_declared_topics_pass_through_a_process(tmp_path):
     assert len(read) == len(ticks) and all(same_extra(one, other) for one, other in zip(ticks, read, strict=True))
 
 
+@pytest.mark.parametrize("block", [True, False])
+def test_a_part_begins_with_the_last_image_before_it_whatever_its_memory_is_used_for(tmp_path, monkeypatch, block):
+    monkeypatch.setattr(shared_queue, "_STATE_BYTES" if block else "_IMAGE_BYTES", 50_000)
+    monkeypatch.setattr(shared_queue, "_MARGIN_BYTES", 1000)
+    options = replace(OWN, block=block, files=Split(seconds=0.2), queue_limit_bytes=1 << 20)
+    with SessionWriter(tmp_path / "p.mcap", HEADER, options) as writer:
+        for tick in ticks_of(600):  # faster than they are written: the memory is always full
+            writer.write(tick)
+    last, repeated = None, 0
+    for part in writer.files:
+        frames = list(SessionReader(part).messages("frame"))
+        if last is not None and frames[0].index == last.index:
+            assert np.array_equal(frames[0].image, last.image)
+            repeated += 1
+        last = frames[-1]
+    assert repeated == len(writer.files) - 1 > 5
+
+
 def test_what_can_not_be_made_is_refused_before_the_run_and_a_discarded_run_leaves_no_file(tmp_path):
     with pytest.raises(SessionError, match="no such directory"):
         SessionWriter(tmp_path / "nowhere" / "x.mcap", HEADER, OWN)
@@ -79,12 +99,16 @@ def test_what_can_not_be_made_is_refused_before_the_run_and_a_discarded_run_leav
 
 
 RUN = """
-import sys, time
+import os, sys, time
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 options, pause_s, side = eval(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
 writer = SessionWriter(sys.argv[1], HEADER, options)
+if len(sys.argv) > 5 and not os.fork():  # a process that has all that is open here
+    os.close(1)
+    time.sleep(20.0)
+    os._exit(0)
 print(writer._recorder._child.process.pid, flush=True)
 for number, tick in enumerate(ticks_of(100_000, shape=(side, side))):
     writer.write(tick)
@@ -93,8 +117,8 @@ for number, tick in enumerate(ticks_of(100_000, shape=(side, side))):
 """
 
 
-def started(path, options, pause_s=0.002, side=64):
-    words = [sys.executable, "-c", RUN, path, options, str(pause_s), str(side)]
+def started(path, options, pause_s=0.002, side=64, *more):
+    words = [sys.executable, "-c", RUN, path, options, str(pause_s), str(side), *more]
     run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     return run, int(run.stdout.readline())
 
@@ -116,6 +140,7 @@ KINDS = {
     "faster than real time": ("WriterOptions(own_process=True, block=True)", 0.0, 64),
     "live": ("WriterOptions(own_process=True)", 0.002, 64),
     "large": ("WriterOptions(own_process=True, frames='raw')", 0.02, 2000),
+    "forked": ("WriterOptions(own_process=True)", 0.002, 64, "fork"),
     "parts": ("WriterOptions(own_process=True, files=Split(seconds=0.5))", 0.002, 64),
 }
 
