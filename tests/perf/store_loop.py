@@ -33,6 +33,7 @@ from tests.perf.store_writers import made_up_header, pictures, ticks_of
 _WIDTH, _HEIGHT = 2448, 2048
 _QUEUE_BYTES = round(2.0 * RATE_HZ * _WIDTH * _HEIGHT)  # as `flowrec record` has it for this camera
 _RING = 140  # images, more than the queue holds
+_IN_A_THREAD = "raw, in a thread"
 _SOAK_RATE_HZ = 100.0
 _RING_S = 30.0
 _SLOTS = 16  # images in shared memory
@@ -72,7 +73,7 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
     prepared = prepare_inputs(config, pipeline, round(duration_s * RATE_HZ))
     images = pictures(_WIDTH, _HEIGHT)
     ring = [np.ones_like(images[0]) for _ in range(_RING)]
-    kinds = ("off", "zstd", "delta", "raw", "a bare thread", "a bare process")
+    kinds = ("off", "zstd", "delta", "raw", _IN_A_THREAD, "a bare thread", "a bare process")
     rows: dict[str, list[Any]] = {kind: [] for kind in kinds}
     path = folder / "stall.mcap"
     with progress("flying", rounds * len(kinds)) as done:
@@ -102,7 +103,8 @@ def _writer(kind: str, path: Path) -> SessionWriter | BareThread | BareProcess |
         return BareThread()
     if kind == "a bare process":
         return BareProcess(_WIDTH * _HEIGHT)
-    options = WriterOptions(frames=kind, overwrite=True, queue_limit_bytes=_QUEUE_BYTES)
+    frames, own = ("raw", False) if kind == _IN_A_THREAD else (kind, True)
+    options = WriterOptions(frames=frames, overwrite=True, queue_limit_bytes=_QUEUE_BYTES, own_process=own)
     return SessionWriter(path, made_up_header(), options)
 
 
@@ -117,6 +119,7 @@ def _row(runs: list[Any], ticks: int) -> dict[str, float]:
         "p50_ms": float(np.median(total_ms)),
         "p99_ms": float(np.percentile(total_ms, 99)),
         "max_ms": max(total_ms),
+        "hand_over_p50_ms": float(np.median([timing.sinks_ms for timing in timings])),
         "hand_over_p99_ms": float(np.percentile([timing.sinks_ms for timing in timings], 99)),
         "dropped": sum(one[-1].dropped_frames for one, _ in runs),
         "queue_mb": max(timing.queue_mb for timing in timings),
@@ -135,8 +138,9 @@ def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -
     with tempfile.TemporaryDirectory(dir=folder) as name:
         path = Path(name) / "soak.mcap"
         pieces = Snapshot(_RING_S) if keeping else Split()
+        options = WriterOptions(frames="delta", files=pieces, own_process=True)
         with (
-            SessionWriter(path, made_up_header(), WriterOptions(frames="delta", files=pieces)) as writer,
+            SessionWriter(path, made_up_header(), options) as writer,
             progress("soaking", count) as done,
         ):
             began = time.perf_counter()
