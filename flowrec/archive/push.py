@@ -15,6 +15,7 @@ from typing import Any
 
 from flowrec.core import Progress, SessionError, UsageError, progress, say
 from flowrec.store import (
+    SESSION_SUFFIX,
     TRAFFIC,
     Bucket,
     Content,
@@ -31,6 +32,7 @@ from flowrec.store import (
     open_bytes,
     session_path,
     session_sha256,
+    signature_file,
 )
 
 _RANGE_BYTES = 64 << 10  # that is read back at a time
@@ -150,7 +152,7 @@ def _folder(target: str) -> UrlPath:
 def _files(session: Path) -> list[Path]:
     """The files of a session, and its notes; SessionError where it is no whole session."""
     files, notes = [file.path for file in Run.at(session).files], notes_file(session)
-    return [*files, notes] if notes.is_file() else files
+    return [*files, *(beside for beside in (notes, *map(signature_file, files)) if beside.is_file())]
 
 
 def _check_names(files: Sequence[Path]) -> None:
@@ -165,7 +167,9 @@ def _push_one(bucket: Bucket, session: Path, file: Path, done: Callable[[int], N
     if file == notes_file(session):
         return _pushed_notes(bucket, file)
     stored = bucket.stat(file.name)
-    if stored is None:
+    if stored is None and file.suffix != SESSION_SUFFIX:  # a signature
+        sent = bucket.upload(file.name, file, done)
+    elif stored is None:
         from flowrec.verbs import check  # late: it takes a second
 
         verdict = check(file)

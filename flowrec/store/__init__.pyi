@@ -36,6 +36,10 @@ from .session_writer import (
     frames_of as frames_of, image_bytes_s as image_bytes_s, session_header as session_header,
     session_writer as session_writer,
 )
+from .signature import (
+    refuse_unusable_key as refuse_unusable_key, sign_file as sign_file, signature_file as signature_file,
+    verify_file as verify_file,
+)
 from .table_columns import columns_of as columns_of, observations_of as observations_of
 from .tables import field_values as field_values, observed_flow as observed_flow
 from .traffic import (

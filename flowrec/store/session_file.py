@@ -34,6 +34,7 @@ from flowrec.store.mcap_writer import FileError, disk_errors, new_mcap, not_writ
 from flowrec.store.roi import Region
 from flowrec.store.run_files import partial_path
 from flowrec.store.session_metadata import OUTCOME, PROFILE, SessionHeader, header_records
+from flowrec.store.signature import signature_file
 from flowrec.store.viewer_pass import draw
 from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.write_queue import Entry
@@ -344,6 +345,7 @@ class SessionFile:
             self._file.sync()
             try:
                 put_in_place(self.partial_path, self.path, overwrite=self._options.overwrite)
+                signature_file(self.path).unlink(missing_ok=True)  # of the file that was replaced
             except (FileExistsError, IsADirectoryError) as error:
                 raise name_taken(self.path, f" (the finished session stays in {self.partial_path})") from error
 

@@ -31,11 +31,15 @@ def check(
     ],
     progress: Callable[[int], None] | None = None,
     bar: Annotated[Bar | None, BAR] = None,
+    signers: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Trusted keys, and whose: as ALLOWED SIGNERS of ssh-keygen."),
+    ] = None,
 ) -> "Verdict":
     """Validate a session; exit status 0: good, 3: usable with losses or anomalies, 1: not usable.
 
-    It finds damage, and edits that leave the digest as it was. Sessions are not signed: whoever can edit the file can
-    edit the digest.
+    It finds damage, and edits that leave the digest as it was. Whoever can edit the file can edit the digest; a
+    signature (`flowrec sign`) says whose it is.
 
     Parameters
     ----------
@@ -59,4 +63,4 @@ def check(
     files = files_to_check(path)
     nbytes = sum(map(size_of, files))
     with nullcontext(progress) if bar is None else bar(f"reading {path.name}", max(nbytes, 1), "bytes") as done:
-        return check_session(path, files, done)
+        return check_session(path, files, done, signers)

@@ -15,6 +15,7 @@ from flowrec.core import (
     seconds,
 )
 from flowrec.store import (
+    UrlPath,
     continuity_fault,
     is_continued,
     is_there,
@@ -22,9 +23,10 @@ from flowrec.store import (
     part_path,
     run_files,
     size_of,
+    verify_file,
 )
 from flowrec.verbs.check_file import EXACT, HEAD, NOT_EXACT, FileCheck
-from flowrec.verbs.verdict import CONSISTENT, CheckFinding, Gap, Verdict
+from flowrec.verbs.verdict import CONSISTENT, DAMAGED, CheckFinding, Gap, Verdict
 
 
 def files_to_check(path: Path) -> list[Path]:
@@ -34,7 +36,9 @@ def files_to_check(path: Path) -> list[Path]:
     return sorted(filter(part_number, run_files(path)), key=part_number) or [path]
 
 
-def check_session(path: Path, files: Sequence[Path], progress: Callable[[int], None] | None) -> Verdict:
+def check_session(
+    path: Path, files: Sequence[Path], progress: Callable[[int], None] | None, signers: Path | None = None
+) -> Verdict:
     """The verdict on the files of a session; parameters and errors as of `flowrec.check`."""
     total = sum(map(size_of, files))
     checks: list[FileCheck] = []
@@ -49,6 +53,7 @@ def check_session(path: Path, files: Sequence[Path], progress: Callable[[int], N
             ended.result = _verdict_so_far(path, covered, [*checks, check])
             raise ended from error
         checks.append(check)
+        _check_signature(check.verdict, signers)
     verdict = checks[0].verdict if list(files) == [path] else _check_run(path, checks)
     verdict.covered = Coverage(sum(check.read_bytes for check in checks), total, "bytes", topics=tuple(verdict.topics))
     if all(check.found.header is not None for check in checks):
@@ -56,6 +61,27 @@ def check_session(path: Path, files: Sequence[Path], progress: Callable[[int], N
     amount, topics = verdict.covered.amount, len(verdict.topics)
     verdict.fact("covered", f"{amount}, {topics} topics, {', '.join(verdict.covered.head) or 'no head'}")
     return verdict
+
+
+def _check_signature(verdict: Verdict, signers: Path | None) -> None:
+    """Add what the signature beside a file says of it."""
+    if isinstance(verdict.path, UrlPath):
+        return
+    found = verify_file(verdict.path, signers)
+    if found is None:
+        if signers is not None:
+            verdict.fact("signature", "none")
+    elif found.fault:
+        verdict.bad("signature", f"{DAMAGED}: the signature beside it is not of this content ({found.fault})")
+        verdict.integrity = f"{DAMAGED} since it was signed"
+    elif found.signer:
+        verdict.fact("signature", f"of {found.signer}, with {found.key}")
+        if verdict.integrity == CONSISTENT:
+            verdict.integrity = f"intact, signed by {found.signer}"
+    elif signers is not None:
+        verdict.odd("signature", f"made with {found.key}, which {signers} does not name as one to be trusted")
+    else:
+        verdict.fact("signature", f"with {found.key}; --signers FILE tells whose it is")
 
 
 def _verdict_so_far(path: Path, covered: Coverage, checks: Sequence[FileCheck]) -> Verdict:
@@ -73,7 +99,9 @@ def _check_run(path: Path, checks: Sequence[FileCheck]) -> Verdict:
     """The verdict on all parts of a run together."""
     run = Verdict(path, checks[0].verdict.covered, parts=[check.verdict for check in checks])
     apart = [check.verdict for check in checks if check.verdict.integrity != CONSISTENT]
-    if apart:
+    if len({check.verdict.integrity for check in checks}) == 1:
+        run.integrity = checks[0].verdict.integrity
+    elif apart:
         run.integrity = f"{apart[0].path.name} is {apart[0].integrity}"
     first_ns, last = checks[0].found.first_ns, checks[-1].found
     parts_with: dict[CheckFinding, list[int]] = {}

@@ -100,6 +100,9 @@ def record(
         bool,
         typer.Option("--accept-losses", help="In real time: record also where images will be lost, or writing fails."),
     ] = False,
+    sign: Annotated[
+        Path | None, typer.Option(metavar="KEY", help="Sign the session with this SSH key when it is complete.")
+    ] = None,
     movie_in_time: Annotated[bool, AS_THE_COMMAND] = False,
 ) -> "Union[Recorded, DryRun]":  # noqa: UP007 - as text
     """Run a mission (survey, refine, plan, navigate) and record every stage.
@@ -148,10 +151,17 @@ def record(
         resolved = prepare(chosen).config
         file = inputs[0] if inputs else None
         return DryRun(resolved, look_at_lab(chosen, file, path) if chosen.rig == "lab" else None)
+    from flowrec.store import refuse_unusable_key, sign_file
     from flowrec.verbs.mission_run import run_mission
 
     realtime = realtime or (movie_in_time and chosen.rig == MOVIE)
-    return run_mission(chosen, path, view, realtime, overwrite, control, inputs, console=console)
+    if sign is not None:
+        refuse_unusable_key(sign)
+    recorded = run_mission(chosen, path, view, realtime, overwrite, control, inputs, console=console)
+    if sign is not None:
+        for file in recorded.sessions:
+            sign_file(file, sign, overwrite=False)
+    return recorded
 
 
 def config_of_call(

@@ -1,5 +1,6 @@
 """`flowrec view`: open a session in the Rerun viewer, take a picture of it, or write layouts for viewers."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -62,11 +63,7 @@ def view(
     from flowrec.view import screenshot as take
 
     if live:
-        if any(value is not None for value in (beside, out, screenshot, time, layout)):
-            raise UsageError("--live: shows a run that is being recorded, and writes no file")
-        from flowrec.verbs.watching import watch
-
-        return Told(after=lambda: watch(session, "serve" if no_open else "spawn"))
+        return _watch(session, no_open, (beside, out, screenshot, time, layout))
     if session is None:
         raise UsageError("SESSION: name a session (.mcap), or --live for a run that is being recorded")
     if session.suffix == ".rrd" and not session.exists():
@@ -86,6 +83,14 @@ def view(
     elif not no_open:
         told += filter(None, [open_viewer(rrd)])
     return Told(lambda: export_json(session, rrd), remarks=lambda: told)
+
+
+def _watch(session: Path | None, no_open: bool, outputs: Iterable[object]) -> Told:
+    if any(value is not None for value in outputs):
+        raise UsageError("--live: shows a run that is being recorded, and writes no file")
+    from flowrec.verbs.watching import watch
+
+    return Told(after=lambda: watch(session, "serve" if no_open else "spawn"))
 
 
 def _write_layouts(session: Path, folder: Path, overwrite: bool) -> Told:

@@ -1,0 +1,102 @@
+"""`flowrec sign`, and what `flowrec check` says of a signature; judged by OpenSSH's own `ssh-keygen`."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from flowrec.core.errors import FlowrecError
+from flowrec.core.system.outputs import OutputError
+from flowrec.store.session_file import Split, WriterOptions
+from flowrec.store.writer import SessionWriter
+from flowrec.verbs.check import check
+from flowrec.verbs.record import record
+from flowrec.verbs.sign import sign
+from tests.store.made_up import HEADER, ticks_of
+
+pytestmark = pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="OpenSSH is not installed")
+
+
+def key_of(folder: Path, name: str) -> Path:
+    key = folder / name
+    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", name, "-f", key], check=True)
+    return key
+
+
+def signers_of(*keys: Path) -> Path:
+    listed = keys[0].with_name("signers")
+    listed.write_text("".join(f"{key.name}@lab {key.with_suffix('.pub').read_text()}" for key in keys))
+    return listed
+
+
+def session_of(folder: Path, options: WriterOptions, ticks: int = 60) -> Path:
+    with SessionWriter(folder / "a.mcap", HEADER, options) as writer:
+        for tick in ticks_of(ticks):
+            writer.write(tick)
+    return writer.path
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> tuple[Path, Path]:
+    folder = tmp_path / "keys"
+    folder.mkdir()
+    return key_of(folder, "ada"), key_of(folder, "eve")
+
+
+@pytest.mark.parametrize("options", [WriterOptions(), WriterOptions(files=Split(seconds=0.4))])
+def test_a_signed_session_is_intact_and_its_signer_is_named(
+    tmp_path: Path, keys: tuple[Path, Path], options: WriterOptions
+) -> None:
+    path, (ada, eve) = session_of(tmp_path, options), keys
+    before = check(path, signers=signers_of(ada, eve))
+    assert before.integrity == "consistent, unsigned"
+    made = sign(path, ada)
+    signed = check(path, signers=signers_of(ada, eve))
+    assert signed.integrity == "intact, signed by ada@lab" and signed.exit_status == before.exit_status
+    assert "intact, signed by ada@lab" in signed.judgement
+    for one in made:  # by OpenSSH alone
+        words = ["ssh-keygen", "-Y", "verify", "-n", "flowrec", "-I", "ada@lab", "-f", signers_of(ada), "-s", one]
+        with one.with_suffix("").open("rb") as content:
+            subprocess.run([*map(str, words)], stdin=content, check=True)
+
+
+def test_what_was_edited_or_signed_by_others_is_not_intact(tmp_path: Path, keys: tuple[Path, Path]) -> None:
+    path, (ada, eve) = session_of(tmp_path, WriterOptions()), keys
+    sign(path, eve)
+    stranger = check(path, signers=signers_of(ada))
+    assert stranger.integrity == "consistent, unsigned" and "does not name" in stranger.findings[-1].text
+    assert "--signers FILE tells whose it is" in check(path).facts["signature"]
+    (made,) = sign(path, ada, overwrite=True)
+    signature = made.read_bytes()
+    # A file whose digest agrees: only the signature tells that it is another one.
+    session_of(tmp_path, WriterOptions(overwrite=True), 59)
+    assert not made.exists() and check(path).integrity == "consistent, unsigned"
+    made.write_bytes(signature)
+    forged = check(path, signers=signers_of(ada))
+    assert forged.exit_status == 1 and forged.integrity == "damaged or edited since it was signed"
+
+
+def test_a_signature_is_not_replaced_and_a_wrong_key_or_list_is_refused(
+    tmp_path: Path, keys: tuple[Path, Path]
+) -> None:
+    path, (ada, eve) = session_of(tmp_path, WriterOptions()), keys
+    sign(path, ada)
+    with pytest.raises(OutputError, match="exists already"):
+        sign(path, eve)
+    sign(path, eve, overwrite=True)
+    assert check(path, signers=signers_of(ada, eve)).integrity == "intact, signed by eve@lab"
+    with pytest.raises(FlowrecError, match="can not be used"):
+        sign(path, tmp_path / "nowhere", overwrite=True)
+    with pytest.raises(FlowrecError, match="no such file"):
+        check(path, signers=tmp_path / "nowhere")
+    with pytest.raises(FlowrecError, match="is no SSH key"):
+        record(out=tmp_path / "b.mcap", sign=tmp_path / "a.mcap")
+    assert not (tmp_path / "b.mcap").exists()
+
+
+def test_a_run_is_signed_when_it_is_complete(tmp_path: Path, keys: tuple[Path, Path]) -> None:
+    record(out=tmp_path / "r.mcap", duration_s=0.5, sign=keys[0])
+    assert check(tmp_path / "r.mcap", signers=signers_of(*keys)).integrity == "intact, signed by ada@lab"
