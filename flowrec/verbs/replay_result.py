@@ -24,15 +24,20 @@ class WorkerResults:
     ----------
     comparison : of the messages.
     lines : a line of text for each result.
+    adopted, computed : results of this run that the loop adopted, and how many of them were computed again.
     """
 
     comparison: Comparison
     lines: list[str] = field(default_factory=list)
+    adopted: int = 0
+    computed: int = 0
 
     def followed_by(self, later: WorkerResults) -> None:
         """Add what was compared in the ticks that follow."""
         self.comparison.followed_by(later.comparison)
         self.lines += later.lines
+        self.adopted += later.adopted
+        self.computed += later.computed
 
 
 class WorkerCheck:
@@ -68,10 +73,14 @@ class WorkerCheck:
         """Take the next tick: note a new order, compute and compare newly adopted results."""
         for name in WORKER_FIELDS:
             adopted = getattr(tick, name)
-            if adopted is None or adopted is getattr(self._last, name) or adopted.request in self._unknown:
+            if adopted is None or adopted is getattr(self._last, name):
+                continue
+            self.results.adopted += adopted.request != 0
+            if adopted.request in self._unknown:
                 continue
             order = self._orders.pop(adopted.request, None)
             computed = replace(work(self._pipeline, order), stamp_ns=tick.stamp_ns) if order is not None else None
+            self.results.computed += computed is not None
             topic = BY_FIELD[name]
             comparison = self.results.comparison
             # The words about a result may have been mended since: they are told, and only what was computed is judged.
@@ -181,6 +190,7 @@ class Replayed:
         lines = self.comparison.lines()
         if self.worker is not None:
             lines += self.worker.lines
+            lines.append(f"slow results: {self.worker.computed} of {self.worker.adopted} computed again")
         if self.digest is not None:
             lines += self.digest[1]
         elif self.worker is not None:
@@ -227,6 +237,7 @@ class Replayed:
             "same": same if whole or same is False else None,
             "identical": identical if whole or identical is False else None,
             "covered": covered.as_json() | of_covered,
+            "slow_results": None if self.worker is None else [self.worker.computed, self.worker.adopted],
             "topics": topics,
             "first": next((each["first"] for each in found if each["first"] is not None), None),
             "digest_faults": None if self.digest is None else [] if self.digest[0] else self.digest[1],

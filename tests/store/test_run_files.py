@@ -315,6 +315,7 @@ def test_a_stretch_of_a_survey_that_was_ordered_before_a_part_begins_is_taken_as
     done = verb.replay_session(part, Change(), verify=True)
     assert done.comparison.identical, done.lines()
     assert "/plan/route: ordered in the part before, taken as recorded" in done.lines()
+    assert done.worker.computed == done.worker.adopted - 1
 
 
 def test_recover_and_export_answer_in_json(run, rrd_only_begun):

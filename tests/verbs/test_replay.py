@@ -64,7 +64,9 @@ def test_a_replay_is_identical_tick_by_tick_and_its_worker_results_can_be_made_a
     assert same, lines
     assert done.comparison.identical, str(done.comparison.first)
     assert done.worker is not None
-    assert len(done.worker.lines) >= 4  # solved, surveyed, refined, planned
+    count = len(done.worker.lines)
+    assert count >= 4  # solved, surveyed, refined, planned
+    assert f"slow results: {count} of {count} computed again" in lines
 
 
 @pytest.mark.parametrize("share", [0.23, *(pytest.param(each, marks=AGAIN) for each in (0.01, 0.77))])
