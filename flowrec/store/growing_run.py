@@ -39,7 +39,7 @@ class LiveRun(NamedTuple):
 
 
 def live_runs() -> list[LiveRun]:
-    """The runs that are recorded by a process of their own just now, the latest last."""
+    """The runs that are recorded by a process of their own just now, the latest last; hidden files are trials."""
     import psutil  # type: ignore[import-untyped]
 
     me = getpass.getuser()
@@ -48,7 +48,9 @@ def live_runs() -> list[LiveRun]:
         words = process.info["cmdline"] or []
         own = str(process.info["username"]).rpartition("\\")[2] == me
         if own and MODULE in words[:-1] and process.info["status"] != psutil.STATUS_ZOMBIE:
-            found.append(LiveRun(Path(words[-1]), process.pid, process.info["create_time"]))
+            path = Path(words[-1])
+            if not path.name.startswith("."):
+                found.append(LiveRun(path, process.pid, process.info["create_time"]))
     return sorted(found, key=lambda run: run.since_unix_s)
 
 

@@ -97,9 +97,9 @@ def test_a_recorder_that_is_killed_ends_the_view_with_what_to_do(tmp_path):
 
 def test_runs_are_listed_while_they_are_recorded_and_only_those_can_be_watched(tmp_path):
     path = tmp_path / "x y.mcap"
-    with SessionWriter(path, HEADER, OPTIONS) as writer:
+    with SessionWriter(path, HEADER, OPTIONS) as writer, SessionWriter(tmp_path / ".trial.mcap", HEADER, OPTIONS):
         writer.write(TICKS[0])
-        (run,) = [run for run in live_runs() if run.path == path]
+        (run,) = [run for run in live_runs() if run.path.parent == tmp_path]
         assert run.process == writer._recorder._child.process.pid
     assert path not in [run.path for run in live_runs()]
     with pytest.raises(SessionError, match="is not being recorded; `flowrec ls --live`"):
