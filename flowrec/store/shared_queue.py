@@ -68,7 +68,8 @@ class SharedQueue:
     def wake_by(self, descriptor: int) -> None:
         """Take the pipe by which the other process is woken."""
         self._wake = descriptor
-        os.set_blocking(descriptor, False)
+        if sys.platform != "win32":
+            os.set_blocking(descriptor, False)
 
     @property
     def nbytes(self) -> int:

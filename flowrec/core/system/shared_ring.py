@@ -137,12 +137,13 @@ def _memory(nbytes: int, handle: str | None) -> tuple[mmap.mmap, str]:
     if sys.platform == "win32":
         handle = handle or f"flowrec-{os.urandom(8).hex()}"
         return mmap.mmap(-1, nbytes, tagname=handle), handle
-    if handle is None:
-        if sys.platform == "linux":
-            descriptor = os.memfd_create("flowrec-ring")
-        else:
-            with tempfile.TemporaryFile(prefix="flowrec-ring-") as file:  # no directory lists it
-                descriptor = os.dup(file.fileno())
-        os.ftruncate(descriptor, nbytes)
-        handle = str(descriptor)
-    return mmap.mmap(int(handle), nbytes), handle
+    else:  # noqa: RET505 - mypy knows by it which lines are of which system
+        if handle is None:
+            if sys.platform == "linux":
+                descriptor = os.memfd_create("flowrec-ring")
+            else:
+                with tempfile.TemporaryFile(prefix="flowrec-ring-") as file:  # no directory lists it
+                    descriptor = os.dup(file.fileno())
+            os.ftruncate(descriptor, nbytes)
+            handle = str(descriptor)
+        return mmap.mmap(int(handle), nbytes), handle
