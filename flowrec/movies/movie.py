@@ -192,10 +192,19 @@ class Movie(ABC):
         Parameters
         ----------
         stated : number of significant bits by the file.
+
+        Raises
+        ------
+        MovieError : more bits than an image can have.
         """
         if self.options.bits is not None:
             return self.options.bits
-        bits = next(bits for bits in PIXEL_BITS if bits >= (stated or kept))
+        bits = next((bits for bits in PIXEL_BITS if bits >= (stated or kept)), None)
+        if bits is None:
+            raise MovieError(
+                f"{self.path}: its samples have {stated or kept} bits, and images of at most {PIXEL_BITS[-1]} are "
+                "recorded; convert it, for example with ffmpeg -pix_fmt gray16le"
+            )
         if bits == 16 and stated is None:
             self._assumed.append(f"{who} 16 bits the camera used; 16 are assumed (movie.bits)")
         return bits

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
@@ -204,7 +205,7 @@ class Feed:
         return Batch(step, changes, self._remarks()), sent
 
 
-class FeedSink:
+class FeedSink(ABC):
     """A sink that hands ticks to a process, if that has started.
 
     Whatever happens to the process, `write` neither waits nor raises.
@@ -239,9 +240,9 @@ class FeedSink:
         leave(feed.process)
         return True
 
+    @abstractmethod
     def close(self) -> None:
         """End the process within a time limit."""
-        raise NotImplementedError
 
     def __enter__(self) -> Self:
         return self

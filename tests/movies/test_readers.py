@@ -14,6 +14,10 @@ import zstandard
 
 from flowrec.core.errors import MovieError
 from flowrec.movies import ReadOptions, open_movie
+from flowrec.rigs.movie.rig import MovieRig
+from flowrec.rigs.movie.source import MovieSource
+from flowrec.stages.config import MovieSettings
+from flowrec.stages.control import Coils
 from tests.extras import needs
 from tests.movies import makers
 
@@ -27,6 +31,23 @@ def pictures(bits=8, count=COUNT):
     slope = np.linspace(0, top, WIDTH)[None, :] * np.ones((HEIGHT, 1))
     dtype = np.uint8 if bits == 8 else np.uint16
     return [np.clip(slope + rng.normal(0, top / 20, slope.shape), 0, top).astype(dtype) for _ in range(count)]
+
+
+def test_the_early_end_of_a_movie_is_what_its_rig_noticed_while_it_played(tmp_path):
+    folder = makers.folder(tmp_path / "pngs", pictures())
+    broken = folder / "img_5.png"
+    broken.write_bytes(broken.read_bytes()[:60])
+    source = MovieSource(MovieSettings(path=str(folder), rate_hz=10.0, partial=True), Coils())
+    source._log_remarks.append("what the log said when it was read")
+    with MovieRig(source, 0.0) as rig:
+        assert len(list(rig.inputs())) == 5
+        assert len(rig.noticed) == 1 and rig.noticed[0].startswith("only the first 5 images were taken: ")
+
+
+def test_samples_of_more_bits_than_an_image_can_have_are_refused(tmp_path):
+    path = makers.folder(tmp_path / "pngs", pictures())
+    with open_movie(path) as movie, pytest.raises(MovieError, match=r"have 32 bits.*convert it, for example with ffm"):
+        movie._depth(32, 32)
 
 
 def read(path, **options):

@@ -70,6 +70,19 @@ def test_ticks_are_seen_while_the_run_goes_on_and_in_the_end_all_of_them_as_they
     assert watcher.failure is None and same(watcher.ticks, SessionReader(path).ticks()) and len(watcher.ticks) == 90
 
 
+def test_no_tick_is_seen_before_its_image_has_come(tmp_path):
+    path = tmp_path / "x.mcap"
+    writer, watcher = begun(path)
+    for tick in TICKS[40:60]:  # as if their images were still to be encoded
+        writer.write(replace(tick, frame=None))
+    writer._queue.wait_for_flush(TICKS[59].stamp_ns)
+    time.sleep(0.5)  # several looks
+    assert [tick.stamp_ns for tick in watcher.ticks] == [tick.stamp_ns for tick in TICKS[:40]]
+    writer.close()
+    watcher.join(HANG_S)
+    assert len(watcher.ticks) == 60
+
+
 def test_a_run_in_parts_is_followed_from_part_to_part(tmp_path):
     path = tmp_path / "x.mcap"
     writer, watcher = begun(path, replace(OPTIONS, files=Split(seconds=0.3)))

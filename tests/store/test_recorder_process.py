@@ -1,5 +1,6 @@
 """The recorder in a process of its own: the run, the recorder or both are killed, stopped, or meet a bad disk."""
 
+import contextlib
 import itertools
 import os
 import resource
@@ -107,7 +108,7 @@ options, pause_s, side = eval(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
 writer = SessionWriter(sys.argv[1], HEADER, options)
 if len(sys.argv) > 5 and not os.fork():  # a process that has all that is open here
     os.close(1)
-    time.sleep(20.0)
+    time.sleep(600.0)
     os._exit(0)
 print(writer._recorder._child.process.pid, flush=True)
 for number, tick in enumerate(ticks_of(100_000, shape=(side, side))):
@@ -119,7 +120,7 @@ for number, tick in enumerate(ticks_of(100_000, shape=(side, side))):
 
 def started(path, options, pause_s=0.002, side=64, *more):
     words = [sys.executable, "-c", RUN, path, options, str(pause_s), str(side), *more]
-    run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, process_group=0)
     return run, int(run.stdout.readline())
 
 
@@ -154,7 +155,11 @@ def test_of_a_run_that_is_killed_every_tick_that_it_handed_over_is_in_a_complete
     run.wait(HANG_S)
     number = last_told(run, number)
     run.stdout.close()
-    until(lambda: not list(tmp_path.glob("*.partial")))
+    try:
+        until(lambda: not list(tmp_path.glob("*.partial")))
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)  # what was forked
     ticks = [tick.stamp_ns for tick in SessionReader(path).ticks()]
     begin_ns = next(ticks_of(1)).stamp_ns
     assert ticks == [begin_ns + each * PERIOD_NS for each in range(len(ticks))]

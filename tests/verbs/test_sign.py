@@ -79,6 +79,15 @@ def test_what_was_edited_or_signed_by_others_is_not_intact(tmp_path: Path, keys:
     assert forged.exit_status == 1 and forged.integrity == "damaged or edited since it was signed"
 
 
+@pytest.mark.parametrize("limit", ['namespaces="git"', 'valid-before="20200101"'])
+def test_a_key_signs_only_what_its_list_allows(tmp_path: Path, keys: tuple[Path, Path], limit: str) -> None:
+    path, (ada, _) = session_of(tmp_path, WriterOptions()), keys
+    sign(path, ada)
+    listed = signers_of(ada)
+    listed.write_text(listed.read_text().replace("ada@lab ", f"ada@lab {limit} "))
+    assert check(path, signers=listed).integrity == "consistent, unsigned"
+
+
 def test_a_signature_is_not_replaced_and_a_wrong_key_or_list_is_refused(
     tmp_path: Path, keys: tuple[Path, Path]
 ) -> None:

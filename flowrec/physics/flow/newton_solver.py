@@ -6,6 +6,7 @@ factorisation serves all of them.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -110,7 +111,7 @@ def local_friction(friction_per_um2: Floats, um_per_px: float, grid: Grid) -> Fl
 
 
 @dataclass(frozen=True, eq=False)
-class Equations:
+class Equations(ABC):
     """The discrete equations of one geometry and one kind of fluid.
 
     The unknowns are the fluxes of the faces (faces,) in m/s. A drive (openings,) holds inlet speeds in m/s and outlet
@@ -125,9 +126,9 @@ class Equations:
         """The grid."""
         return self.momentum.grid
 
+    @abstractmethod
     def viscous_force(self, flux: Floats) -> Floats:
         """(faces,) viscous force and drag of the depth, with the sign of a resistance; m/s."""
-        raise NotImplementedError
 
     def residual(self, flux: Floats, drive: Floats, inertia: float, push: Floats | float = 0.0) -> Floats:
         """(faces,) residual of the momentum equations without the inner pressure, which has to balance it; m/s."""

@@ -56,7 +56,7 @@ class MovieRig:
         self._log = (source.log if source.log is not None else FieldLog()).shift_clock(nanoseconds(delay_s))
         self._end_ns = None if duration_s is None else nanoseconds(duration_s)
         self._realtime = realtime
-        self._known = len(source.remarks)
+        self._known = source.remarks
         stamps_ns = source.stamps_ns
         self.taken = 0
         self.images = len(stamps_ns) if self._end_ns is None else int((stamps_ns <= self._end_ns).sum())
@@ -64,7 +64,7 @@ class MovieRig:
     @property
     def noticed(self) -> list[str]:
         """Remarks made while the images were read, such as an early end."""
-        return self._source.remarks[self._known :]
+        return [remark for remark in self._source.remarks if remark not in self._known]
 
     def __enter__(self) -> MovieRig:
         return self

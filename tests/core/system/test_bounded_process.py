@@ -2,6 +2,7 @@
 
 import operator
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -45,6 +46,12 @@ def test_a_file_that_takes_more_time_than_it_may_is_refused():
 def test_a_reader_that_crashes_takes_nobody_with_it():
     with BoundedProcess("a.bin", 10.0) as process, pytest.raises(UsageError, match=r"its reader has ended \(SIGABRT"):
         process.call(os.abort)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a process ends by no signal there")
+def test_a_reader_that_the_system_kills_was_short_of_memory():
+    with BoundedProcess("a.bin", 10.0) as process, pytest.raises(UsageError, match=r"^a\.bin: needs more than"):
+        process.call(signal.raise_signal, signal.SIGKILL)
 
 
 def test_nothing_is_left_running_once_it_is_closed():

@@ -206,12 +206,14 @@ class Grabber:
     def _work(self) -> None:
         # Above the loop, which may be what uses all of the processor.
         with realtime_priority(Priority.DEVICE):
-            camera = self._make()
+            camera: Camera | None = None
             try:
+                camera = self._make()
                 self._note_connection(camera.open())
             except Exception as error:  # noqa: BLE001  raised in the thread that waits for the camera
                 self._failure = error
-                _within(_CLOSE_S, camera.close)
+                if camera is not None:
+                    _within(_CLOSE_S, camera.close)
                 self._opened.set()
                 return
             self._opened.set()

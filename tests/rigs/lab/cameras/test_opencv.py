@@ -105,6 +105,14 @@ def test_what_can_not_be_opened_is_one_line(change: dict[str, object], complaint
     assert complaint in str(raised.value) and "\n" not in str(raised.value)
 
 
+def test_a_driver_that_refuses_its_settings_is_told_before_the_camera_could_have_answered() -> None:
+    wanted = replace(WANTED, pixel_format="BayerRG8")
+    began_s = time.monotonic()
+    with pytest.raises(RigError, match="must be one of Mono8"), Grabber(lambda: OpencvCamera.of(wanted), wanted):
+        pass
+    assert time.monotonic() < began_s + 10.0  # the grabber gives a camera 20 s to answer
+
+
 def test_another_size_or_colours_are_said(tmp_path: Path) -> None:
     path = tmp_path / "colour.avi"
     movie = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 25.0, (64, 48))
