@@ -109,7 +109,7 @@ def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] 
                     )
                     sinks.append(stack.enter_context(writer))
                 if "viewing" in kind:
-                    sinks.append(stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), "serve")))
+                    sinks.append(stack.enter_context(LiveView(scene_of(config, chip, path), "serve")))
                 timings[kind] += paced_run(prepared, config, pipeline, sinks)
                 if "recording" in kind:
                     writer.close({"outcome": "bench"})

@@ -50,7 +50,7 @@ from .methods import (
 from .outside import (
     FACT as FACT, Outside as Outside, VERBS as VERBS, entry_points_of as entry_points_of, outside_facts as outside_facts, the_one as the_one,
 )
-from .provenance import provenance as provenance, user_name as user_name
+from .provenance import PACKAGE as PACKAGE, provenance as provenance, user_name as user_name
 from .ranges import (
     Fault as Fault, OneOf as OneOf, PositiveShare as PositiveShare, Range as Range, Seed as Seed, Share as Share,
     Threads as Threads, Weight as Weight, check_ranges as check_ranges, faults as faults, hints as hints,
@@ -85,8 +85,8 @@ from .system.numba_setup import compiled as compiled, kernels_cached as kernels_
 from .system.output_folder import OutputFolder as OutputFolder, marker_of as marker_of
 from .system.outputs import (
     FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, Output as Output, OutputError as OutputError, PICTURE as PICTURE,
-    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, name_taken as name_taken, note_written as note_written,
-    written_sha256 as written_sha256,
+    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, is_as_written as is_as_written, name_taken as name_taken,
+    note_written as note_written, written_sha256 as written_sha256,
 )
 from .system.processes import (
     Priority as Priority, child_command as child_command, child_environment as child_environment,

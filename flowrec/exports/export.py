@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
+from importlib.metadata import version
 from pathlib import Path
 
-from flowrec.core import Coverage, Output, OutputFolder, UsageError, note_written, progress, say, warn, written_sha256
+from flowrec.core import (
+    PACKAGE,
+    RRD,
+    Coverage,
+    Output,
+    OutputFolder,
+    UsageError,
+    is_as_written,
+    note_written,
+    progress,
+    say,
+    warn,
+    written_sha256,
+)
 from flowrec.exports.formats import EXPORTS, Exporter
 from flowrec.store import Session, files_behind, input_blamed, named_beside
+
+_MADE_FROM = "made_from"  # in the list of a folder's exports
 
 
 def export(
@@ -39,14 +56,11 @@ def export(
     second = None if beside is None else Session.of(beside)
     if second is not None:
         exporter = _beside(file_format, session, second)
-        if out is None:
-            out = named_beside(session.path, f"{session.path.stem}_and_{second.path.stem}{exporter.suffixes[0]}")
-    target = _target(session, exporter, file_format, None if out is None else Path(out))
+    target = _target(session, second, exporter.suffixes, file_format, out)
     facts = {"format": file_format, "session": session.path.name, "session_key": session.key}
-    inputs = tuple(files_behind(session.path))
+    inputs = _inputs(session, second)
     if second is not None:
         facts["beside_key"] = second.key
-        inputs += tuple(files_behind(second.path))
     if exporter.folder:
         output: Output | OutputFolder = OutputFolder(target, facts, exporter.suffixes, inputs, overwrite)
     else:
@@ -63,12 +77,37 @@ def export(
         done(length_s)  # it reads to the end or raises, and tells less often how far
     if isinstance(output, Output):
         try:
-            note_written(target, facts)
+            note_written(target, facts | {_MADE_FROM: _made_from(inputs)})
         except OSError as error:  # the export itself is whole
             warn(f"{target}: its hash can not be kept ({error.strerror or error}): only --overwrite will replace it")
     took_s, amount = time.perf_counter() - began_s, Coverage(length_s, length_s, "s").amount
     say(f"{target} written in {took_s:.1f} s, {amount} of the session; {exporter.advice} {target}")
     return target
+
+
+def kept_rrd(
+    session: Session | Path | str, out: Path | str | None = None, beside: Session | Path | str | None = None
+) -> Path | None:
+    """The .rrd that `export` made of the same sessions, if neither it, nor they, nor flowrec have changed since."""
+    session, second = Session.of(session), None if beside is None else Session.of(beside)
+    target = _target(session, second, RRD, "rrd", out)
+    made_from = _made_from(_inputs(session, second))
+    return target if made_from and is_as_written(target, {_MADE_FROM: made_from}) else None
+
+
+def _inputs(session: Session, second: Session | None) -> tuple[Path, ...]:
+    return tuple(files_behind(session.path)) + (() if second is None else tuple(files_behind(second.path)))
+
+
+def _made_from(inputs: tuple[Path, ...]) -> str:
+    """A hash of names, sizes and times of what an export is made of: sessions and code; '' for sessions at a URL."""
+    if not inputs:
+        return ""
+    found = []
+    for path in (*inputs, *sorted(PACKAGE.rglob("*.py"))):
+        state = path.stat() if path.exists() else None
+        found.append((str(path), None if state is None else (state.st_size, state.st_mtime_ns)))
+    return hashlib.sha256(repr((version("rerun-sdk"), found)).encode()).hexdigest()
 
 
 def _beside(file_format: str, session: Session, second: Session) -> Exporter:
@@ -80,10 +119,14 @@ def _beside(file_format: str, session: Session, second: Session) -> Exporter:
     return RrdExport.of_pair(session, second)
 
 
-def _target(session: Session, exporter: Exporter, file_format: str, out: Path | None) -> Path:
-    suffix = exporter.suffixes[0]
+def _target(
+    session: Session, second: Session | None, suffixes: tuple[str, ...], file_format: str, out: Path | str | None
+) -> Path:
+    suffix = suffixes[0]
     name = session.path.stem + (suffix or f"_{file_format}")
     if out is None:
-        return named_beside(session.path, name)
-    within = suffix and out.is_dir() and out.suffix not in exporter.suffixes
+        pair = "" if second is None else f"{session.path.stem}_and_{second.path.stem}{suffix}"
+        return named_beside(session.path, pair or name)
+    out = Path(out)
+    within = suffix and out.is_dir() and out.suffix not in suffixes
     return out / name if within else out

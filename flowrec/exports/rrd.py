@@ -11,8 +11,7 @@ import numpy as np
 
 from flowrec.core import DOUBTS, RRD, SessionError
 from flowrec.physics import Chip
-from flowrec.run import ReplayFiles, before_after
-from flowrec.stages import Pipeline, ResolvedConfig, assemble
+from flowrec.stages import ResolvedConfig, calibration_of
 from flowrec.store import Session, files_of
 from flowrec.view import (
     FIGURES,
@@ -30,6 +29,8 @@ from flowrec.view import (
 
 if TYPE_CHECKING:
     import rerun as rr
+
+    from flowrec.run import ReplayFiles
 
 
 # What the table of a replay tells of its commands and the panel leaves out: it has room for eleven rows.
@@ -62,7 +63,7 @@ class RrdExport:
 
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         scene = replace(
-            scene_of(session.config, session.chip, assemble(session.config, session.chip), session.path),
+            scene_of(session.config, session.chip, session.path),
             key=session.key,
             doubts=str(session.outcome.get(DOUBTS, "")),
         )
@@ -74,6 +75,8 @@ class RrdExport:
             summary = _pair(session, self._second)
         elif parent is not None:
             prefixes, sessions = REPLAY, [Session(parent), session]
+            from flowrec.run import ReplayFiles
+
             summary = _comparison(ReplayFiles.of(*sessions))
         else:
             summary = document_of_run(session.path.stem, session.last, session.outcome)
@@ -82,6 +85,8 @@ class RrdExport:
 
 
 def _comparison(pair: ReplayFiles) -> rr.TextDocument:
+    from flowrec.run import before_after  # which imports all stages
+
     rows = before_after(pair)
     planners = next((values for key, *values in rows if key == "planner"), [None, None])
     hidden = {*_OF_COMMANDS, *(("planner",) if planners[0] == planners[1] else ())}
@@ -97,7 +102,7 @@ def _pair(first: Session, second: Session) -> rr.TextDocument:
     return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, notes)
 
 
-def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:
+def scene_of(config: ResolvedConfig, chip: Chip, path: Path) -> Scene:
     """Static data of a session for the viewer."""
     properties = {
         "chip": chip.name,
@@ -110,12 +115,12 @@ def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path)
     windows = config.recording.region != "whole"
     return Scene(
         chip,
-        pipeline.calibration,
-        pipeline.robot,
+        calibration_of(config, chip),
+        config.robot,
         path.stem,
         properties,
         windows=windows,
-        camera_shape=pipeline.image_shape,
+        camera_shape=(config.camera.height_px, config.camera.width_px),
     )
 
 

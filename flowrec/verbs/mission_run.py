@@ -229,7 +229,7 @@ class _Mission:
         disk, writer, duration_s = self._disk, self._writer, self._config.duration_s
         return Watching(
             view,
-            (self._config, self._chip, self._pipeline, self._output.path),
+            (self._config, self._chip, self._output.path),
             self.run_control if console else None,
             lambda: {"disk": disk.text, "file_mb": writer.bytes_written / 1e6, "duration_s": duration_s},
         )

@@ -76,13 +76,24 @@ def view(
         return _write_layouts(session, layout, overwrite)
     if screenshot is not None:
         Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
-    rrd = session if session.suffix == ".rrd" else export(session, out, overwrite, beside=beside)
-    told: list[str] = []
+    rrd, told = _recording(session, beside, out, overwrite)
     if screenshot is not None:
         told += [*take(rrd, screenshot, time_s=time, overwrite=overwrite), f"{screenshot} written"]
     elif not no_open:
         told += filter(None, [open_viewer(rrd)])
     return Told(lambda: export_json(session, rrd), remarks=lambda: told)
+
+
+def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: bool) -> tuple[Path, list[str]]:
+    """The .rrd of a session, made if there is none of just these files; and a remark."""
+    if session.suffix == ".rrd":
+        return session, []
+    from flowrec.exports import kept_rrd
+
+    kept = kept_rrd(session, out, beside)
+    if kept is not None:
+        return kept, [f"{kept} is as it was made of this session"]
+    return export(session, out, overwrite, beside=beside), []
 
 
 def _watch(session: Path | None, no_open: bool, outputs: Iterable[object]) -> Told:

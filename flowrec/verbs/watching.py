@@ -14,7 +14,7 @@ from flowrec.console import Console, RunEnded
 from flowrec.core import FlowrecError, UsageError, View, say, seconds
 from flowrec.physics import Chip
 from flowrec.run import RunControl, Sink
-from flowrec.stages import Pipeline, ResolvedConfig
+from flowrec.stages import ResolvedConfig
 
 if TYPE_CHECKING:
     from flowrec.view import LiveView
@@ -26,7 +26,7 @@ class Watching:
     def __init__(
         self,
         view: View,
-        scene: tuple[ResolvedConfig, Chip, Pipeline, Path],
+        scene: tuple[ResolvedConfig, Chip, Path],
         control: RunControl | None,
         remarks: Callable[[], dict[str, Any]],
     ) -> None:
@@ -34,7 +34,7 @@ class Watching:
 
         Parameters
         ----------
-        scene : settings, chip and pipeline of the run, and the path of its session.
+        scene : settings and chip of the run, and the path of its session.
         control : what the console steers; None: no console.
         remarks : what the console shows besides ticks; asked in another thread.
         """
@@ -55,7 +55,7 @@ class Watching:
             camera = scene[0].camera
             shown = replace(shown, image_px=(camera.width_px, camera.height_px))
             port = self._live.port if self._live.pid is not None else None
-            self._console = Console(control, shown, scene[3].name, port, remarks, say)
+            self._console = Console(control, shown, scene[2].name, port, remarks, say)
             say(self._console.message)
             if self._console.tunnel:
                 say(self._console.tunnel)
@@ -92,7 +92,6 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"]) -> None:
     SessionError : it is not being recorded, or its file is damaged.
     """
     from flowrec.exports import scene_of
-    from flowrec.stages import assemble
     from flowrec.store import GrowingRun, live_runs
     from flowrec.view import LiveView
 
@@ -103,7 +102,7 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"]) -> None:
             raise UsageError(f"--live: {len(runs) or 'no'} runs are being recorded{there}")
         path = runs[0].path
     run = GrowingRun(path)
-    scene = scene_of(run.config, run.chip, assemble(run.config, run.chip), run.path)
+    scene = scene_of(run.config, run.chip, run.path)
     last_ns = 0
     with LiveView(scene, mode) as shown:
         say(f"{run.path}: Ctrl-C ends the view, not the run")

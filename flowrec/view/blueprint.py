@@ -14,6 +14,7 @@ from rerun.blueprint.encodings import TimelineColumn
 from flowrec.core import seconds
 from flowrec.view import colours
 from flowrec.view import entities as e
+from flowrec.view.columns import FRAME, SESSION_TIME
 from flowrec.view.entities import entity_path, points
 from flowrec.view.maps import ColourBar
 from flowrec.view.scene import Box, Scene
@@ -53,7 +54,7 @@ def blueprint(
     """
     views = _Views(scene, present, prefixes, end_s, tuple(phases), live)
     body = _single(views) if len(prefixes) == 1 else _double(views)
-    return layout_of(body, timeline=e.SESSION_TIME, play_state="following" if live else "playing")
+    return layout_of(body, timeline=SESSION_TIME, play_state="following" if live else "playing")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +167,7 @@ class _Views:
         """The summary, and behind it the events."""
         paths = [entity_path(prefix, entity) for prefix in self.prefixes for entity in (e.EVENTS, e.OPERATOR)]
         # Hidden by name: an empty list would show the timeline of the view.
-        events = events_view(paths, [TimelineColumn(each, visible=False) for each in (e.SESSION_TIME, e.FRAME)])
+        events = events_view(paths, [TimelineColumn(each, visible=False) for each in (SESSION_TIME, FRAME)])
         summary = rrb.TextDocumentView(name="Summary", origin=entity_path("", e.SUMMARY))
         return rrb.Tabs(*([summary] if e.SUMMARY in self.present else []), events, active_tab=0)
 

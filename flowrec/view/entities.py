@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 from rerun import new_entity_path
 
 from flowrec.view import colours
 from flowrec.view.colours import Rgb
-
-SESSION_TIME = "session time"
-FRAME = "frame"
+from flowrec.view.columns import FRAME, SESSION_TIME, ColumnBuffer
 
 MEASURED = "camera/measured"  # what is moved by the registration that a refinement found, and by the image's shift
 IMAGE = "camera/measured/image"
@@ -106,22 +106,59 @@ def entity_path(prefix: str, entity: str) -> str:
 class EntityLogger:
     """Logs the entities of one session below `prefix`: '', or one of REPLAY or PAIR.
 
+    Parameters
+    ----------
+    columns : takes the rows of moving entities, which are written when it is flushed; None: they are sent at once.
+
     Attributes
     ----------
     present : the OPTIONAL entities, and those of extra topics, that were ever logged.
     """
 
-    def __init__(self, stream: rr.RecordingStream, prefix: str) -> None:
+    def __init__(self, stream: rr.RecordingStream, prefix: str, columns: ColumnBuffer | None = None) -> None:
         self.stream = stream
         self.prefix = prefix
+        self._columns = columns
+        self._stamp_ns = 0
+        self._index: int | None = None
         self.style = _STYLES[prefix]
         self.present: set[str] = set()
 
     def log(self, entity: str, *components: rr.AsComponents, static: bool = False) -> None:
         """Log the components of an entity at the present time, or (static) for all times."""
         self.stream.log(entity_path(self.prefix, entity), components[0], *components[1:], static=static)
-        if not static and (entity in OPTIONAL or entity.startswith(EXTRA)) and not isinstance(components[0], rr.Clear):
+        if not static and not isinstance(components[0], rr.Clear):
+            self._note(entity)
+
+    def row(self, entity: str, kind: Any, **fields: Sequence[Any]) -> None:
+        """Log fields of the archetype `kind`, each a list of components, of an entity that changes with every tick."""
+        if self._columns is None:
+            self.log(entity, kind.from_fields(**fields))
+            return
+        self._columns.add(entity_path(self.prefix, entity), kind, self._stamp_ns, self._index, fields)
+        self._note(entity)
+
+    def scalars(self, entity: str, *values: float) -> None:
+        """Log a value of each line of a plot."""
+        self.row(entity, rr.Scalars, scalars=values)
+
+    def encoded_row(self, entity: str, kind: Any, field: str, encode: Callable[..., bytes], *given: Any) -> None:
+        """Log a field whose one component takes time to encode."""
+        done = encode(*given) if self._columns is None else self._columns.encode(encode, *given)
+        self.row(entity, kind, **{field: [done]})
+
+    def _note(self, entity: str) -> None:
+        if entity in OPTIONAL or entity.startswith(EXTRA):
             self.present.add(entity)
+
+    def set_time(self, stamp_ns: int, index: int | None) -> None:
+        """The present time, and the number of the image if there is one."""
+        self._stamp_ns, self._index = stamp_ns, index
+        self.stream.set_time(SESSION_TIME, duration=np.timedelta64(stamp_ns, "ns"))
+        if index is not None:
+            self.stream.set_time(FRAME, sequence=index)
+        else:
+            self.stream.disable_timeline(FRAME)
 
     def clear(self, entity: str) -> None:
         """Show nothing of an entity from the present time on."""

@@ -32,6 +32,7 @@ from flowrec.physics import on_chip, sample
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.camera_pictures import WindowCompleter, encode_jpeg
+from flowrec.view.columns import ColumnBuffer
 from flowrec.view.drawing import CIRCLE, CROSS, Trail
 from flowrec.view.entities import EntityLogger, label, points
 from flowrec.view.flow_logger import FlowLogger
@@ -57,6 +58,7 @@ class TickLogger:
     ----------
     images : whether the camera's images are logged.
     speeds : scale of the maps; loggers that share it paint their maps alike.
+    columns : see EntityLogger.
 
     Attributes
     ----------
@@ -73,11 +75,12 @@ class TickLogger:
         *,
         images: bool = True,
         speeds: maps.SpeedScale | None = None,
+        columns: ColumnBuffer | None = None,
     ) -> None:
         self.image_step = 1
         self._scene = scene
-        self._entities = EntityLogger(stream, prefix)
-        self._log = self._entities.log
+        self._entities = EntityLogger(stream, prefix, columns)
+        self._log, self._row, self._scalars = self._entities.log, self._entities.row, self._entities.scalars
         self.present = self._entities.present
         self._style = self._entities.style
         self._images = images
@@ -99,13 +102,7 @@ class TickLogger:
     def log(self, tick: Tick, frame_index: int | None = None) -> None:
         """Log what is new since the previous tick; `frame_index` is for a tick without its frame."""
         self._last, self._tick = self._tick, tick
-        stream = self._entities.stream
-        stream.set_time(e.SESSION_TIME, duration=np.timedelta64(tick.stamp_ns, "ns"))
-        index = tick.frame.index if tick.frame is not None else frame_index
-        if index is not None:
-            stream.set_time(e.FRAME, sequence=index)
-        else:
-            stream.disable_timeline(e.FRAME)
+        self._entities.set_time(tick.stamp_ns, tick.frame.index if tick.frame is not None else frame_index)
         if tick.refined is not self._last.refined or tick.shift is not self._last.shift:
             self._log_registration(tick)
         self.states.end_marks(tick.stamp_ns)
@@ -137,17 +134,17 @@ class TickLogger:
                 self._log_demand(message)
             case Currents():
                 # The currents themselves oscillate at this frequency, too fast to be drawn from a sample a frame.
-                self._log(e.AMPLITUDE, rr.Scalars(message.amplitude_mt))
-                self._log(e.FREQUENCY, rr.Scalars(message.frequency_hz))
-                self._log(e.HEADING, rr.Scalars(math.degrees(message.heading_rad)))
+                self._scalars(e.AMPLITUDE, message.amplitude_mt)
+                self._scalars(e.FREQUENCY, message.frequency_hz)
+                self._scalars(e.HEADING, math.degrees(message.heading_rad))
             case Health():
                 self.states.log_alarm(message.alarm)
                 if math.isfinite(message.nis):
-                    self._log(e.NIS_MEAN, rr.Scalars(message.nis))
-                self._log(e.PULSATION, rr.Scalars(100.0 * message.pulsation_share))
+                    self._scalars(e.NIS_MEAN, message.nis)
+                self._scalars(e.PULSATION, 100.0 * message.pulsation_share)
             case Timing():
                 computing = [message.track_ms, message.observe_ms, message.control_ms]
-                self._log(e.TIMING, rr.Scalars([*computing, message.sinks_ms, message.total_ms]))
+                self._scalars(e.TIMING, *computing, message.sinks_ms, message.total_ms)
             case Event():
                 self._log_text(e.EVENTS, message.text, _LEVELS.get(message.level, "INFO"))
             case OperatorEvent():
@@ -166,17 +163,18 @@ class TickLogger:
                 continue
             values = np.atleast_1d(np.asarray(getattr(message, each.name), np.float64))  # None becomes NaN
             if np.isfinite(values).any():
-                self._log(f"{e.EXTRA}{path}/{each.name}", rr.Scalars(values))
+                self._scalars(f"{e.EXTRA}{path}/{each.name}", *values.tolist())
 
     def _log_image(self, frame: Frame) -> None:
         if not self._images or frame.image.size == 0:
             return
         if self._placed_step != self.image_step:
             self._placed_step = self.image_step
-            self._log(e.IMAGE, maps.transform_of(self._scene.preview_to_plane(self.image_step)), static=True)
+            placed = maps.transform_of(self._scene.preview_to_plane(self.image_step))
+            drawn = rr.EncodedImage.from_fields(media_type="image/jpeg", draw_order=-20.0)
+            self._log(e.IMAGE, placed, drawn, static=True)
         image = self._windows.complete(frame.image) if self._scene.windows else frame.image
-        jpeg = encode_jpeg(image, frame.bits, _JPEG_QUALITY)
-        self._log(e.IMAGE, rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=-20.0))
+        self._entities.encoded_row(e.IMAGE, rr.EncodedImage, "blob", encode_jpeg, image, frame.bits, _JPEG_QUALITY)
 
     def _log_route(self, route: Route) -> None:
         self._flow.log_time_to_go(route)
@@ -206,7 +204,7 @@ class TickLogger:
         centre = self._scene.to_plane(place_um)
         colour = self._style.robot if estimate.seen else colours.PALE
         ring = [centre + self._robot_px * CIRCLE]
-        self._log(e.ROBOT, rr.LineStrips2D.from_fields(strips=ring, colors=colour))
+        self._row(e.ROBOT, rr.LineStrips2D, strips=ring, colors=[colour])
         # A word only where something is wrong: the title of the view states the colours, and words hide each other.
         last = self._last.estimate
         if not estimate.seen:
@@ -217,18 +215,18 @@ class TickLogger:
             self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(positions=[], labels=[]))
         trail = self._trail.add(estimate.stamp_ns, centre)
         if len(trail) > 1:
-            self._log(e.TRAIL, rr.LineStrips2D.from_fields(strips=[np.array(trail)]))
+            self._row(e.TRAIL, rr.LineStrips2D, strips=[np.array(trail)])
         flow = estimate.flow_um_s
         on_map = sample(field, place_um) if field is not None else (math.nan, math.nan)
-        self._log(e.FLOW_COMPONENTS, rr.Scalars([flow[0], on_map[0], flow[1], on_map[1]]))
+        self._scalars(e.FLOW_COMPONENTS, flow[0], on_map[0], flow[1], on_map[1])
         speeds = [math.hypot(*flow), math.hypot(*on_map)]
         if truth is not None:
             if not self._style.second:
                 speeds.append(math.hypot(*truth.flow_um_s))
-            self._log(e.ESTIMATE_ERROR, rr.Scalars(math.dist(estimate.position_um, truth.position_um)))
-        self._log(e.FLOW_SPEED, rr.Scalars(speeds))
+            self._scalars(e.ESTIMATE_ERROR, math.dist(estimate.position_um, truth.position_um))
+        self._scalars(e.FLOW_SPEED, *speeds)
         if math.isfinite(estimate.nis):
-            self._log(e.NIS, rr.Scalars(estimate.nis))
+            self._scalars(e.NIS, estimate.nis)
 
     def _place_of_word(self, centre: NDArray[np.float64]) -> NDArray[np.float64]:
         """Position of a word about the robot at which neither the view's border nor the second session's robot cuts it.
@@ -248,14 +246,14 @@ class TickLogger:
         # Without a reference nothing is logged, not NaN: the plot shows a gap either way, but statistics differ.
         if math.isfinite(demand.error_um):
             if demand.error_um > 0.0:  # a policy has no reference
-                self._log(e.TRACKING_ERROR, rr.Scalars(demand.error_um))
+                self._scalars(e.TRACKING_ERROR, demand.error_um)
             reference = self._scene.to_plane(demand.reference_um)
-            self._log(e.REFERENCE, rr.Points2D.from_fields(positions=[reference]))
+            self._row(e.REFERENCE, rr.Points2D, positions=[reference])
         if self._tick.estimate is not None:
             length = _COMMAND_PX * self._unit_px / self._scene.robot.speed_limit_um_s
             vector = self._scene.directions(demand.velocity_um_s * length)
             position = self._scene.to_plane(self._on_chip(self._tick.estimate.position_um))
-            self._log(e.COMMAND, rr.Arrows2D.from_fields(origins=[position], vectors=[vector]))
+            self._row(e.COMMAND, rr.Arrows2D, origins=[position], vectors=[vector])
 
     def _log_text(self, entity: str, text: str, level: str) -> None:
         # The time is in the text: a column of the view shows it to the nanosecond.

@@ -14,6 +14,7 @@ import rerun as rr
 
 from flowrec.core import Tick, seconds
 from flowrec.view.blueprint import blueprint
+from flowrec.view.columns import ColumnBuffer
 from flowrec.view.entities import SUMMARY
 from flowrec.view.logger import TickLogger
 from flowrec.view.maps import SpeedScale
@@ -112,18 +113,23 @@ def _log_all(
 ) -> None:
     describe(stream, scene)
     prefixes, speeds = tuple(ticks), SpeedScale()
-    loggers = [TickLogger(stream, scene, prefix, images=prefix == prefixes[0], speeds=speeds) for prefix in prefixes]
     first_ns: int | None = None
     stamp_ns = 0
     index: int | None = None
-    for count, (stamp_ns, number, tick) in enumerate(_merge(ticks.values())):
-        first_ns = stamp_ns if first_ns is None else first_ns
-        if number == 0 and tick.frame is not None:
-            index = tick.frame.index
-        # Replayed ticks may have no frame, but belong to a recorded one.
-        loggers[number].log(tick, frame_index=index)
-        if progress is not None and count % _PROGRESS_EVERY == 0:
-            progress(seconds(stamp_ns - first_ns))
+    with ColumnBuffer(stream) as columns:
+        loggers = [
+            TickLogger(stream, scene, prefix, images=prefix == prefixes[0], speeds=speeds, columns=columns)
+            for prefix in prefixes
+        ]
+        for count, (stamp_ns, number, tick) in enumerate(_merge(ticks.values())):
+            first_ns = stamp_ns if first_ns is None else first_ns
+            if number == 0 and tick.frame is not None:
+                index = tick.frame.index
+            # Replayed ticks may have no frame, but belong to a recorded one.
+            loggers[number].log(tick, frame_index=index)
+            if progress is not None and count % _PROGRESS_EVERY == 0:
+                progress(seconds(stamp_ns - first_ns))
+        columns.flush()
     present |= loggers[0].present
     for prefix, logger in zip(prefixes[1:], loggers[1:], strict=True):
         present |= {f"{prefix} {what}" for what in logger.present}

@@ -15,7 +15,7 @@ from rerun.experimental import ViewerClient, ViewerState
 from flowrec.core import PICTURE, FlowrecError, Output, nanoseconds
 from flowrec.store import ForeignError, SessionMetadata
 from flowrec.view import viewer
-from flowrec.view.entities import SESSION_TIME
+from flowrec.view.columns import SESSION_TIME
 
 _LOG_TIME = "message_log_time"  # Rerun's name for the session clock of an .mcap
 _START_S = 20.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import resource
 import shutil
 from itertools import islice
@@ -19,6 +20,7 @@ from flowrec.exports.formats import EXPORTS
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.cli import app
+from flowrec.verbs.view import view
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
@@ -189,3 +191,25 @@ def test_the_verb_takes_the_folder_as_a_word_and_says_what_it_made(tmp_path: Pat
     covered = facts.pop("covered")
     assert covered["whole"] and covered["unit"] == "s"
     assert facts == {"session": str(GOLDEN), "parquet": str(tmp_path / "t"), "bytes": nbytes}
+
+
+def test_view_keeps_the_recording_of_an_unchanged_session_and_writes_that_of_a_changed_one(
+    brief: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(brief.read_bytes())
+    rrd = path.with_suffix(".rrd")
+
+    def written_anew() -> bool:
+        before_ns = rrd.stat().st_mtime_ns if rrd.exists() else 0
+        view(path, no_open=True)
+        return rrd.stat().st_mtime_ns != before_ns
+
+    assert written_anew() and not written_anew()
+    os.utime(path)  # as if it were another one of that size
+    assert written_anew() and not written_anew()
+    rrd.write_bytes(rrd.read_bytes()[:-100])
+    with pytest.raises(OutputError):  # it is no longer ours to replace
+        view(path, no_open=True)
+    rrd.unlink()
+    assert written_anew()

@@ -21,7 +21,6 @@ from rerun.chunk import RrdReader
 from flowrec.core.messages import Frame
 from flowrec.core.topics import Tick
 from flowrec.exports.rrd import scene_of
-from flowrec.stages.pipeline import assemble
 from flowrec.store.session import Session
 from flowrec.view import live_server, viewer
 from flowrec.view.live import LiveView
@@ -186,7 +185,7 @@ def test_a_window_keeps_its_server_after_the_run(
 
 def test_the_summary_tells_what_is_known_and_ends_as_that_of_the_session(session: Path) -> None:
     stored = Session(session)
-    live = LiveSummary(scene_of(stored.config, stored.chip, assemble(stored.config, stored.chip), session))
+    live = LiveSummary(scene_of(stored.config, stored.chip, session))
     texts = []
     for tick in stored.ticks(with_frames=False):
         if live.add(tick):

@@ -18,7 +18,8 @@ from flowrec.core.errors import SessionError
 from flowrec.core.messages import Health, OperatorEvent
 from flowrec.core.system.outputs import RRD, Output
 from flowrec.core.topics import Tick
-from flowrec.view.rrd_file import write_rrd
+from flowrec.view.logger import TickLogger
+from flowrec.view.rrd_file import open_stream, write_rrd
 from flowrec.view.scene import Scene
 from flowrec.view.summary_text import summary_document
 
@@ -134,6 +135,39 @@ def test_the_timelines_are_session_time_to_the_nanosecond_and_frame(
 def test_a_replay_without_frames_lies_on_the_frames_of_the_recording(double: File) -> None:
     frames = double.columns["/replayed/camera/robot"]["frame"]
     assert [frame for frame in frames if frame is not None] == list(range(120))
+
+
+def cells(path: Path) -> set[tuple[str, ...]]:
+    """Every value of a recording with its entity, its times and its component."""
+    reader = RrdReader(path)
+    (recording,) = reader.recordings()
+    found = set()
+    for chunk in reader.stream(store=recording):
+        if chunk.entity_path.startswith("/__"):
+            continue
+        batch = chunk.to_record_batch()
+        columns = {
+            name: (column.cast(pa.int64()) if pa.types.is_duration(column.type) else column).to_pylist()
+            for name, column in zip(batch.schema.names, batch.columns, strict=True)
+            if not name.startswith("rerun.controls")
+        }
+        for row in range(chunk.num_rows):
+            times = str(columns["session time"][row]) if "session time" in columns else ""
+            times += f", {columns['frame'][row]}" if "frame" in columns else ""
+            found |= {(chunk.entity_path, times, name, str(values[row])) for name, values in columns.items()}
+    return {cell for cell in found if cell[-1] != "None"}
+
+
+def test_a_file_holds_what_a_live_viewer_is_sent_row_by_row(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
+    write_rrd(tmp_path / "file.rrd", scene, {"": ticks})
+    with open_stream(scene) as stream:
+        stream.save(tmp_path / "live.rrd")
+        logger = TickLogger(stream, scene)
+        for tick in ticks:
+            logger.log(tick)
+    stream.disconnect()
+    file, live = cells(tmp_path / "file.rrd"), cells(tmp_path / "live.rrd")
+    assert len(live) > 20 * len(ticks) and file == live
 
 
 def test_what_is_not_new_is_not_logged_again(single: File) -> None:

@@ -162,6 +162,12 @@ def written_sha256(path: Path, facts: Mapping[str, str]) -> str:
     return str(noted.get(_SHA256, ""))
 
 
+def is_as_written(path: Path, facts: Mapping[str, str]) -> bool:
+    """True if flowrec wrote the export from these facts, and nothing in it was changed since, by its hash."""
+    sha256 = written_sha256(path, facts)
+    return bool(sha256) and path.is_file() and sha256_of(path) == sha256
+
+
 def note_written(path: Path, facts: Mapping[str, str]) -> None:
     """Keep the hash of an export that was just written; OSError if that is not possible."""
     listed = {name: noted for name, noted in _read_list(path.parent / LIST).items() if path.with_name(name).exists()}
