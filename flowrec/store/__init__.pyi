@@ -16,7 +16,7 @@ from .remote_file import (
 from .roi import nonzero_window as nonzero_window
 from .run_files import (
     PARTIAL_SUFFIX as PARTIAL_SUFFIX, Run as Run, SESSION_SUFFIX as SESSION_SUFFIX,
-    continuity_fault as continuity_fault, files_behind as files_behind, files_of as files_of,
+    continuity_fault as continuity_fault, existing_session as existing_session, files_behind as files_behind, files_of as files_of,
     is_continued as is_continued, is_snapshot as is_snapshot, part_number as part_number, part_path as part_path,
     run_files as run_files, run_path as run_path, runs_in as runs_in, session_sha256 as session_sha256,
 )

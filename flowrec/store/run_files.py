@@ -61,6 +61,14 @@ def run_files(path: Path) -> list[Path]:
     return sorted(other for other in path.parent.iterdir() if other.is_file() and run_path(other) == path)
 
 
+def existing_session(named: Path | str) -> Path:
+    """The path as of `session_path`; SessionError if it is local, and neither it nor a part of its run is there."""
+    path = session_path(named)
+    if not isinstance(path, UrlPath) and not path.exists() and not run_files(path):
+        open_bytes(path)  # which says so
+    return path
+
+
 def _parts_at(path: UrlPath) -> list[Path]:
     """The parts of a run at a URL: those that the server lists, else those that follow each other."""
     from flowrec.store.remote_file import are_there, is_listed, objects_in

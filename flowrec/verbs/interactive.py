@@ -15,11 +15,13 @@ from rich.markup import escape
 from rich.text import Text
 
 from flowrec.core import Event, Level, Phase, Progress, Tick, console, outlet, printable, progress, say, seconds
-from flowrec.run import DiskMonitor, RunControl, Watchdog
-from flowrec.store import SessionWriter
+from flowrec.run import RunControl
 
 if TYPE_CHECKING:
     from rich.live import Live
+
+    from flowrec.run import DiskMonitor, Watchdog
+    from flowrec.store import SessionWriter
 
 _EXPLAIN_AFTER_S = 2.0  # without a tick
 _PERIOD_S = 0.12

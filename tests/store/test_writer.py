@@ -372,7 +372,7 @@ def test_the_thread_of_a_live_run_is_never_behind_other_programs_and_in_real_tim
 
 def test_a_chunk_is_sealed_before_it_outgrows_what_a_reader_takes_and_no_message_may(tmp_path, monkeypatch):
     monkeypatch.setattr("flowrec.store.chunk._MESSAGE_LIMIT_BYTES", 100_000)
-    path, options = tmp_path / "x.mcap", WriterOptions(block=True, frames="raw", flush_s=100.0)
+    path, options = tmp_path / "x.mcap", WriterOptions(block=True, frames="raw", flush_s=100.0, sync_s=100.0)
     with SessionWriter(path, HEADER, options) as writer:
         for tick in ticks_of(12, shape=(200, 200)):  # images of 40 kB
             writer.write(tick)

@@ -151,7 +151,7 @@ def test_a_machine_holds_what_both_its_ticks_and_its_disk_hold(held: Held, enoug
 
 SEEN = """
 import json, sys
-from numba.core.dispatcher import Dispatcher
+from flowrec.core.system.numba_setup import Kernel
 from flowrec.verbs.admission import rehearse
 from flowrec.verbs.replay_change import Change
 from flowrec.verbs.session_replay import replay_session
@@ -159,9 +159,9 @@ from flowrec.stages.config import load_config
 
 def known():
     return {
-        f"{name}.{kernel.py_func.__name__}": len(kernel.signatures)
+        f"{name}.{kernel.py_func.__name__}": len(kernel.dispatcher.signatures)
         for name, module in list(sys.modules.items()) if name.startswith("flowrec.")
-        for kernel in vars(module).values() if isinstance(kernel, Dispatcher)
+        for kernel in vars(module).values() if isinstance(kernel, Kernel)
     }
 
 rehearse(load_config())

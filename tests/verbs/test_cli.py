@@ -136,8 +136,8 @@ def test_info_tells_how_a_session_ended(session: Path) -> None:
     assert facts["topics"]["/camera/frame"] > 100
 
 
-HEAVY = {"torch", "rerun", "filterpy", "matplotlib", "scipy.stats"}
-STAGES = {"numpy", "scipy", "numba", "cv2"}
+HEAVY = {"torch", "rerun", "filterpy", "matplotlib", "numba", "scipy.sparse", "scipy.stats"}
+STAGES = {"numpy", "scipy", "cv2"}
 
 
 @pytest.mark.parametrize(
@@ -148,6 +148,7 @@ STAGES = {"numpy", "scipy", "numba", "cv2"}
         (("record", "--set", "robot.nosuch=1"), HEAVY | {"flowrec.verbs.mission_run", "flowrec.verbs.preparation"}),
         (("ls", "."), HEAVY | STAGES),
         (("info", "nosuch.mcap"), HEAVY | STAGES),
+        (("replay", "nosuch.mcap", "--verify"), HEAVY | STAGES),
     ],
 )
 def test_a_verb_imports_no_library_that_it_does_not_need(words: tuple[str, ...], unwanted: set[str]) -> None:

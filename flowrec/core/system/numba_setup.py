@@ -3,6 +3,8 @@
 numba keys a cached kernel by the file that it is in, and not by the kernels of other files that it calls: after a
 change of one of those it would keep using the old code. So the cache is a folder whose name holds a hash of all files
 with kernels. It lies outside the installation, which may be read-only.
+
+numba is imported by the first call of a kernel: it takes a quarter of a second, which most commands do not need.
 """
 
 from __future__ import annotations
@@ -17,15 +19,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
-from numba import njit
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_config: Any = numba.config  # it makes its attributes as it is imported
 _PACKAGE = Path(__file__).parents[2]
 _DECORATED = "\n@compiled\n"  # in a file with kernels
 _OWN = Path("core", "system", "numba_setup.py")
@@ -40,12 +39,47 @@ def compiled(function: Function) -> Function:
     A kernel assigns element by element: what is assigned to a slice, `np.where` and `np.interp` take two seconds more
     to compile, most of it for messages that are never shown.
     """
-    folder = _cache_folder()
-    before, _config.CACHE_DIR = _config.CACHE_DIR, folder  # for this kernel only, not for those of other packages
-    try:
-        return cast(Function, njit(cache=bool(folder))(function))
-    finally:
-        _config.CACHE_DIR = before
+    return cast(Function, Kernel(function))
+
+
+class Kernel:
+    """A function that numba compiles, also where another kernel calls it.
+
+    Attributes
+    ----------
+    py_func : the function in Python.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+
+    def __call__(self, *given: Any) -> Any:
+        return self.dispatcher(*given)
+
+    @functools.cached_property
+    def dispatcher(self) -> Any:
+        """The function as numba compiles it for each signature."""
+        import numba
+
+        _register()
+        config: Any = numba.config  # it makes its attributes as it is imported
+        folder = _cache_folder()
+        before, config.CACHE_DIR = config.CACHE_DIR, folder  # for this kernel only, not for those of other packages
+        try:
+            return numba.njit(cache=bool(folder))(self.py_func)
+        finally:
+            config.CACHE_DIR = before
+
+
+@functools.cache
+def _register() -> None:
+    """Tell numba that a kernel which is called by another is what it compiles of it."""
+    from numba.extending import typeof_impl
+
+    @typeof_impl.register(Kernel)
+    def _(kernel: Kernel, context: Any) -> Any:
+        return typeof_impl(kernel.dispatcher, context)
 
 
 def kernels_cached() -> bool:
@@ -63,7 +97,7 @@ def kernel_files(package: Path = _PACKAGE) -> list[Path]:
 @functools.cache
 def _cache_folder() -> str:
     """Folder in which kernels are cached; '' where nothing can be written, then they are compiled in every process."""
-    state = hashlib.sha256(f"{sys.version} {numba.__version__}".encode())
+    state = hashlib.sha256(f"{sys.version} {version('numba')}".encode())
     for path in kernel_files():
         state.update(path.read_bytes())
     for place in _places():
@@ -83,8 +117,8 @@ def _cache_folder() -> str:
 
 def _places() -> Iterator[Path]:
     """Candidates for the cache: numba's own setting, the user's caches, the folder of temporary files."""
-    if _config.CACHE_DIR:
-        yield Path(_config.CACHE_DIR).absolute()
+    if told := os.environ.get("NUMBA_CACHE_DIR", ""):
+        yield Path(told).absolute()
     home = os.environ.get("XDG_CACHE_HOME", "")
     if not os.path.isabs(home):  # noqa: PTH117 - unset, or to be ignored by the XDG specification
         home = os.path.expanduser("~/.cache")  # noqa: PTH111 - which raises nothing where there is no home

@@ -13,10 +13,8 @@ import itertools
 import math
 
 import numpy as np
-import scipy  # its ndimage loads at first use, not at start-up
+import scipy  # its ndimage and sparse load at first use, not at start-up
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from flowrec.core import Bools, ChipError, Floats
 from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip
@@ -158,8 +156,8 @@ def _thin_out(rng: np.random.Generator, count: int) -> list[_Edge]:
             break
         fewer = [edge for edge in edges if edge != lattice[k]]
         degree = np.bincount(np.ravel(fewer), minlength=count)
-        graph = coo_array((np.ones(len(fewer)), np.transpose(fewer)), shape=(count, count))
-        if degree.min() >= 2 and connected_components(graph, directed=False)[0] == 1:
+        graph = scipy.sparse.coo_array((np.ones(len(fewer)), np.transpose(fewer)), shape=(count, count))
+        if degree.min() >= 2 and scipy.sparse.csgraph.connected_components(graph, directed=False)[0] == 1:
             edges = fewer
     return edges
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its sparse loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from flowrec.core import Floats, Ints
 
@@ -29,19 +28,19 @@ class Triplets:
     def matrix(self) -> Any:
         """CSR with the sums of duplicate entries."""
         rows, columns, values = (np.concatenate(part) for part in zip(*self.parts, strict=True))
-        return sp.csr_array((values, (rows, columns)), shape=self.shape)
+        return scipy.sparse.csr_array((values, (rows, columns)), shape=self.shape)
 
 
 def averages(rows: Ints, columns: Ints, shape: tuple[int, int]) -> Any:
     """CSR whose row is the mean of some columns, of pairs of a row and a column."""
     count = np.bincount(rows, minlength=shape[0])
-    return sp.csr_array((1.0 / count[rows], (rows, columns)), shape=shape)
+    return scipy.sparse.csr_array((1.0 / count[rows], (rows, columns)), shape=shape)
 
 
 def components(one: Ints, two: Ints, count: int) -> Ints:
     """(count,) numbers of the connected components of nodes, of which edges join two each."""
-    edges = sp.coo_array((np.ones(len(one), bool), (one, two)), shape=(count, count))
-    return np.asarray(connected_components(edges, directed=False)[1], np.int64)
+    edges = scipy.sparse.coo_array((np.ones(len(one), bool), (one, two)), shape=(count, count))
+    return np.asarray(scipy.sparse.csgraph.connected_components(edges, directed=False)[1], np.int64)
 
 
 def per_flux(per_velocity: Any, open_fraction: Floats) -> Any:
@@ -53,4 +52,4 @@ def per_flux(per_velocity: Any, open_fraction: Floats) -> Any:
 def scaled_rows(factors: NDArray[Any], matrix: Any) -> Any:
     """CSR `matrix` with its rows times `factors`; ten times as fast as the product with a diagonal matrix."""
     data = matrix.data * np.repeat(factors, np.diff(matrix.indptr))
-    return sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+    return scipy.sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)

@@ -18,7 +18,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solveh_banded
+import scipy  # its linalg loads at first use, not at start-up
 
 from flowrec.core import Bools, Floats, Ints
 
@@ -226,7 +226,7 @@ def _relax(middle: Floats, inward: Floats, wall: Ints, stiffness: Floats) -> Flo
             right[m : n - 3 + m] -= jacobian[:, m] * target
             for o in range(m, 4):
                 bands[o - m, m : n - 3 + m] += jacobian[:, m] * jacobian[:, o]
-        offset = np.clip(solveh_banded(bands, right, lower=True), -FARTHEST_PX, FARTHEST_PX)
+        offset = np.clip(scipy.linalg.solveh_banded(bands, right, lower=True), -FARTHEST_PX, FARTHEST_PX)
         point = middle + offset[:, None] * normals
         missed = np.abs(offset) > 0.5 * np.abs((inward * normals).sum(axis=1)) + SLACK_PX
         near = np.convolve(missed, np.ones(2 * SOFTENED + 1), "same") > 0.0

@@ -18,7 +18,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its sparse loads at first use, not at start-up
 
 from flowrec.core import M_PER_UM, Floats
 from flowrec.physics.chip.chip import Chip
@@ -277,7 +277,7 @@ class GeneralisedSystem(Equations):
         if inertia:
             operator = operator + inertia * self.momentum.convection_jacobian(flux)
         curl = self.stream.curl
-        return factorise(curl.T @ operator @ curl), sp.csr_array(operator)
+        return factorise(curl.T @ operator @ curl), scipy.sparse.csr_array(operator)
 
 
 def generalised_system(chip: Chip, law: ViscosityLaw, k: int) -> GeneralisedSystem:

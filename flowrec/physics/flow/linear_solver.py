@@ -27,8 +27,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.linalg import SuperLU, splu
+import scipy  # its sparse loads at first use, not at start-up
 
 from flowrec.core import Floats, separate_large_blocks
 from flowrec.physics.chip.chip import Chip
@@ -67,8 +66,8 @@ def factorise(matrix: Any) -> Factors:
     if matrix.shape[0] == 0:  # a channel of one cell between inlets has no degree of freedom
         return _EmptyFactors()
     separate_large_blocks()
-    factors: Factors = splu(
-        sp.csc_matrix(matrix),
+    factors: Factors = scipy.sparse.linalg.splu(
+        scipy.sparse.csc_matrix(matrix),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.01,
         options={"SymmetricMode": True},
@@ -134,7 +133,7 @@ def held_bytes(results: Iterable[Any]) -> tuple[dict[int, int], list[tuple[Sized
         seen.add(id(part))
         if isinstance(part, np.ndarray):
             sizes[id(part)] = part.nbytes
-        elif isinstance(part, SuperLU):
+        elif isinstance(part, scipy.sparse.linalg.SuperLU):
             sizes[id(part)] = _BYTES_PER_FACTOR * part.nnz
         elif isinstance(part, bytes):
             sizes[id(part)] = len(part)

@@ -21,7 +21,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its sparse loads at first use, not at start-up
 
 from flowrec.core import Bools, Floats, Ints
 from flowrec.physics.flow.assembly import Triplets, per_flux
@@ -60,9 +60,9 @@ class Momentum:
 
     def convection_jacobian(self, flux: Floats) -> Any:
         """dN/dq (faces, faces)."""
-        gather = sp.csr_array(sp.hstack([sp.eye_array(len(self.volume))] * 6))
-        by_flux = sp.diags_array(self.side_velocity @ flux) @ self.side_flux
-        by_velocity = sp.diags_array(self.side_flux @ flux) @ self.side_velocity
+        gather = scipy.sparse.csr_array(scipy.sparse.hstack([scipy.sparse.eye_array(len(self.volume))] * 6))
+        by_flux = scipy.sparse.diags_array(self.side_velocity @ flux) @ self.side_flux
+        by_velocity = scipy.sparse.diags_array(self.side_flux @ flux) @ self.side_velocity
         return gather @ (by_flux + by_velocity)
 
     @cached_property
@@ -71,11 +71,11 @@ class Momentum:
         free = np.ones(self.grid.faces)
         for faces in (self.grid.u, self.grid.v):
             free[faces.number[faces.kind == INLET]] = 0.0
-        gradient = sp.diags_array(free) @ self.gradient
+        gradient = scipy.sparse.diags_array(free) @ self.gradient
         laplacian = gradient.T @ gradient
         if not any(opening.kind == "outlet" for opening in self.grid.openings):
             # In a closed box the level of the pressure is free: that of the first cell is set to 0.
-            laplacian = laplacian + sp.coo_array(([1.0], ([0], [0])), shape=laplacian.shape)
+            laplacian = laplacian + scipy.sparse.coo_array(([1.0], ([0], [0])), shape=laplacian.shape)
         return gradient.T.tocsr(), factorise(laplacian)
 
 
@@ -95,7 +95,7 @@ class _Sides:
         """CSR."""
         faces = self.columns.shape[1]
         ends = np.arange(0, 12 * faces + 1, 2)
-        matrix = sp.csr_array((self.values.ravel(), self.columns.ravel(), ends), shape=(6 * faces, faces))
+        matrix = scipy.sparse.csr_array((self.values.ravel(), self.columns.ravel(), ends), shape=(6 * faces, faces))
         matrix.eliminate_zeros()
         return matrix
 

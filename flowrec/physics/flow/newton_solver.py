@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its sparse loads at first use, not at start-up
 
 from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, Floats
 from flowrec.physics.chip.chip import Chip
@@ -261,7 +261,7 @@ def geometry_key(chip: Chip, k: int) -> tuple[Hashable, ...]:
 def with_friction(bare: System, friction_per_um2: Floats, um_per_px: float) -> System:
     """The equations of a chip whose pixels (h, w) have more friction than those of `bare`."""
     friction = local_friction(friction_per_um2, um_per_px, bare.grid)
-    resistance = sp.csr_array(bare.resistance + sp.diags_array(friction * bare.momentum.volume))
+    resistance = scipy.sparse.csr_array(bare.resistance + scipy.sparse.diags_array(friction * bare.momentum.volume))
     return replace(bare, resistance=resistance, stokes=factorise(bare.stream.curl.T @ resistance @ bare.stream.curl))
 
 
@@ -269,6 +269,6 @@ def newton_equations(chip: Chip, k: int, walls: LevelSet | None = None) -> Syste
     """Assemble the equations without the cache. `walls` replaces the walls of the mask."""
     momentum = momenta.assemble(grids.build(chip, k, walls))
     stream, friction = streams.assemble(momentum.grid), depth_friction(chip, k)
-    resistance = sp.csr_array(momentum.viscous + sp.diags_array(friction * momentum.volume))
+    resistance = scipy.sparse.csr_array(momentum.viscous + scipy.sparse.diags_array(friction * momentum.volume))
     stokes = factorise(stream.curl.T @ resistance @ stream.curl)
     return System(momentum, stream, friction, resistance, stokes)

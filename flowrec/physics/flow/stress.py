@@ -23,7 +23,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its sparse loads at first use, not at start-up
 
 from flowrec.core import Bools, Floats, Ints
 from flowrec.physics.flow.assembly import Triplets, averages, per_flux, scaled_rows
@@ -89,21 +89,21 @@ def assemble(momentum: Momentum, curl: Any, friction: Floats | None) -> Stress:
     strain_rate = _cell_gradients(u, v, points)
     square, gradient, planar = _shear_rate(grid, cell, corner, strain_rate, shear, wall, friction, fraction)
     rows, faces, places = zip(*(_stresses(part, other) for part, other in ((u, mixed[1]), (v, mixed[0]))), strict=True)
-    strain, face, place = sp.vstack(rows, format="csr"), np.concatenate(faces), np.concatenate(places)
+    strain, face, place = scipy.sparse.vstack(rows, format="csr"), np.concatenate(faces), np.concatenate(places)
     viscous = len(place)
-    at = sp.csr_array((np.ones(viscous), (np.arange(viscous), place)), shape=(viscous, points))
+    at = scipy.sparse.csr_array((np.ones(viscous), (np.arange(viscous), place)), shape=(viscous, points))
     if friction is not None:
         # The drag of the depth, with the mean viscosity around the face.
         balanced = np.unique(face)
-        around = sp.csr_array((np.ones(viscous), (face, place)), shape=(grid.faces, points))[balanced]
-        drag = sp.csr_array(
+        around = scipy.sparse.csr_array((np.ones(viscous), (face, place)), shape=(grid.faces, points))[balanced]
+        drag = scipy.sparse.csr_array(
             ((friction * momentum.volume)[balanced], (np.arange(len(balanced)), balanced)),
             shape=(len(balanced), grid.faces),
         )
-        strain = sp.vstack([strain, drag], format="csr")
-        at = sp.vstack([at, scaled_rows(1.0 / around.sum(axis=1), around)], format="csr")
+        strain = scipy.sparse.vstack([strain, drag], format="csr")
+        at = scipy.sparse.vstack([at, scaled_rows(1.0 / around.sum(axis=1), around)], format="csr")
         face = np.concatenate([face, balanced])
-    gather = sp.csr_array((np.ones(len(face)), (face, np.arange(len(face)))), shape=(grid.faces, len(face)))
+    gather = scipy.sparse.csr_array((np.ones(len(face)), (face, np.arange(len(face)))), shape=(grid.faces, len(face)))
     used = np.unique(at.indices)  # no stress needs the others
     return Stress(gather, strain, at[:, used], gradient, square[used], planar, viscous, curl)
 
@@ -154,7 +154,7 @@ def _mean_at(points: int, places: tuple[Ints, Ints], values: list[Any], known: l
     place = np.concatenate(places)
     column = np.arange(len(place)) if known is None else np.flatnonzero(np.concatenate(known))
     mean = averages(place[column], column, (points, len(place)))
-    return mean @ sp.vstack(values, format="csr"), np.diff(mean.indptr) > 0
+    return mean @ scipy.sparse.vstack(values, format="csr"), np.diff(mean.indptr) > 0
 
 
 def _cell_gradients(u: _Component, v: _Component, points: int) -> tuple[Any, Bools]:
@@ -212,7 +212,7 @@ def _shear_rate(
     to_corner = averages(at_corner[used], at_cell[used], (points, points))
     is_cell = np.arange(points) < cell.size
     open_cell, closed_cell = is_cell & fluid, is_cell & ~fluid
-    one = sp.diags_array
+    one = scipy.sparse.diags_array
     by_strain = one(4.0 * open_cell) + scaled_rows(4.0 * (~is_cell & fluid), to_corner)
     by_shear = one((~is_cell & fluid).astype(float)) + scaled_rows(open_cell, to_cell)
     by_wall = one((~is_cell & ~fluid).astype(float)).tocsr()
@@ -228,8 +228,10 @@ def _shear_rate(
         # 6 V / H between cells at the distance h, for f = 12 h^2 / H^2.
         gradients.append(one(np.sqrt(3.0 * friction) / fraction).tocsr())
         keep.append(np.ones(n, bool))
-    square = sp.hstack([part.tocsc()[:, kept] for part, kept in zip(squares, keep, strict=True)], format="csr")
-    gradient = sp.vstack([part[kept] for part, kept in zip(gradients, keep, strict=True)], format="csr")
+    square = scipy.sparse.hstack(
+        [part.tocsc()[:, kept] for part, kept in zip(squares, keep, strict=True)], format="csr"
+    )
+    gradient = scipy.sparse.vstack([part[kept] for part, kept in zip(gradients, keep, strict=True)], format="csr")
     square.eliminate_zeros()
     return square, gradient, planar
 
@@ -260,4 +262,4 @@ def _stresses(part: _Component, other: Any) -> tuple[Any, Ints, Ints]:
     mean = 0.25 * (transposed[0] + transposed[1] + transposed[2] + transposed[3])
     rows = [(own + extra - mean)[part.balanced] for own, extra in zip(part.parts, transposed, strict=True)]
     places = np.concatenate([place[part.balanced] for place in (*part.cells, *part.corners)])
-    return sp.vstack(rows, format="csr"), np.tile(part.me[part.balanced], 4), places
+    return scipy.sparse.vstack(rows, format="csr"), np.tile(part.me[part.balanced], 4), places

@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its optimize loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from flowrec.core import compiled
 
@@ -121,7 +121,10 @@ def fit_noise(time_s: Floats, positions_um: Floats, flags: Flags, start: NoiseMo
     else:
         starts = [np.log([1.0, 0.1 / dt, 1.0 / dt**3]), np.log([1.0, 3.0 / dt, 0.03 / dt**3])]
     options = {"xatol": 0.05, "fatol": 0.1, "maxfev": _EVALUATIONS}
-    found = min((minimize(cost, each, method="Nelder-Mead", options=options) for each in starts), key=lambda r: r.fun)
+    found = min(
+        (scipy.optimize.minimize(cost, each, method="Nelder-Mead", options=options) for each in starts),
+        key=lambda r: r.fun,
+    )
     error, drift, agility = np.exp(np.clip(found.x, -60.0, 60.0)).tolist()
     return NoiseModel(error, error * drift, error * agility)
 

@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its sparse loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import dijkstra
 
 from flowrec.core import Floats
 from flowrec.physics import Chip, Sensitivities, clearance_um, compute_cached, median_width_um
@@ -41,8 +40,8 @@ def _channel_cells(chip: Chip) -> Any:
         if rows is not None:
             break
         reach *= LONGER
-    weights = sp.csr_array(np.stack(rows))
-    return sp.csr_array(weights @ sp.diags_array(1.0 / np.maximum(weights.sum(axis=0), 1e-12)))
+    weights = scipy.sparse.csr_array(np.stack(rows))
+    return scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(1.0 / np.maximum(weights.sum(axis=0), 1e-12)))
 
 
 def cell_widening(chip: Chip, cells: Any) -> Floats:
@@ -101,7 +100,7 @@ def _cover(graph: Any, order: NDArray[np.intp], reach: float) -> list[Floats] | 
             continue
         if len(rows) == MOST:
             return None
-        distance = dijkstra(graph, directed=False, indices=int(pixel), limit=2.5 * reach)
+        distance = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=int(pixel), limit=2.5 * reach)
         rows.append(np.where(np.isfinite(distance), np.exp(-2.0 * (distance / reach) ** 2), 0.0))
         covered |= distance <= reach
     return rows
@@ -124,7 +123,9 @@ def _pixel_graph(mask: NDArray[np.bool_]) -> Any:
         columns.append(two[both])
         lengths.append(np.full(np.count_nonzero(both), length))
     count = int(number.max()) + 1
-    return sp.csr_array((np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), (count, count))
+    return scipy.sparse.csr_array(
+        (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), (count, count)
+    )
 
 
 def resistance_modes(expansion: Sensitivities, cells: Any) -> Floats:
@@ -167,4 +168,4 @@ def _face_average(expansion: Sensitivities) -> Any:
             columns.append(side[both])
     at, beside = np.concatenate(rows), np.concatenate(columns)
     count = np.bincount(at, minlength=grid.faces)
-    return sp.csr_array((1.0 / count[at], (at, beside)), shape=(grid.faces, int(number.max()) + 1))
+    return scipy.sparse.csr_array((1.0 / count[at], (at, beside)), shape=(grid.faces, int(number.max()) + 1))

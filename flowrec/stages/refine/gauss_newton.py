@@ -21,11 +21,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its ndimage and sparse load at first use, not at start-up
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
-from scipy.sparse.linalg import splu
 
 from flowrec.core import Floats
 from flowrec.stages.refine.case import Case
@@ -68,10 +66,10 @@ class _Rows:
         self.parts.append((np.broadcast_to(values, (n, m)).ravel()[used], rows[used], columns.ravel()[used]))
         self.count += n
 
-    def matrix(self) -> sp.csr_array:
+    def matrix(self) -> scipy.sparse.csr_array:
         """(rows, unknowns)."""
         values, rows, columns = (np.concatenate(part) for part in zip(*self.parts, strict=True))
-        return sp.csr_array((values, (rows, columns)), shape=(self.count, self.unknowns))
+        return scipy.sparse.csr_array((values, (rows, columns)), shape=(self.count, self.unknowns))
 
 
 def balance(case: Case, guess: Floats | None = None) -> tuple[Floats, Floats, Floats]:
@@ -95,12 +93,14 @@ class _LeastSquares:
         self.place = np.full(3 * self.pixels, -1)
         self.place[self.which] = np.arange(len(self.which))
         ones = np.ones(len(self.which))
-        self.embed = sp.csr_array((ones, (self.which, self.place[self.which])), shape=(3 * self.pixels, self.unknowns))
+        self.embed = scipy.sparse.csr_array(
+            (ones, (self.which, self.place[self.which])), shape=(3 * self.pixels, self.unknowns)
+        )
         self.start = np.concatenate([np.moveaxis(case.velocity, -1, 0).ravel(), case.pressure.ravel()])
         self.largest = max(float(np.abs(case.pressure).max()), 1.0)
         # Width of the channel, from which follows the residual per relative error of the speed: 12 / width^2.
-        distance = distance_transform_edt(np.pad(case.fluid, 1, mode="edge"))[1:-1, 1:-1]
-        self.channel = np.maximum(2.0 * maximum_filter(distance, 9) * case.fluid, 2.0)
+        distance = scipy.ndimage.distance_transform_edt(np.pad(case.fluid, 1, mode="edge"))[1:-1, 1:-1]
+        self.channel = np.maximum(2.0 * scipy.ndimage.maximum_filter(distance, 9) * case.fluid, 2.0)
         fluid, inside = (_tensor(mask)[None] for mask in (case.fluid, case.inside))
         self.physics = Physics.of(fluid, inside, case.reynolds, case.friction, case.viscosity)
         self.speed = self._local_rms(case.velocity)
@@ -119,15 +119,17 @@ class _LeastSquares:
         for number, floor in enumerate(FLOORS):
             prior = self._prior(speed, floor)
             physics, target = self._equations(speed, floor, change)
-            rows = sp.vstack([prior, physics]).tocsr()
+            rows = scipy.sparse.vstack([prior, physics]).tocsr()
             normal, load = (rows.T @ rows).tocsc(), rows.T @ np.concatenate([np.zeros(prior.shape[0]), target])
             for left in reversed(range(REWEIGHTED)):
                 scale = ANNEALED**left if number == 0 else 1.0
                 first = number == 0 and left == REWEIGHTED - 1  # nothing is known yet: no observation is an outlier
                 weight = np.full(len(self.case.noise), 1.0) if first else self._robust_weight(change, scale)
                 weight = weight / self.case.noise**2
-                full = normal + sum((h.T @ sp.diags_array(weight) @ h for h in self.operators), start=0.0 * normal)
-                factors = splu(
+                full = normal + sum(
+                    (h.T @ scipy.sparse.diags_array(weight) @ h for h in self.operators), start=0.0 * normal
+                )
+                factors = scipy.sparse.linalg.splu(
                     full.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
                 )
                 observed = zip(self.operators, self.innovations, strict=True)
@@ -136,7 +138,7 @@ class _LeastSquares:
         image = self._image(change)
         return image[..., :2], image[..., 2], self._std(rows, weight, factors)
 
-    def _std(self, rows: sp.csr_array, weight: Floats, factors: Any) -> Floats:
+    def _std(self, rows: scipy.sparse.csr_array, weight: Floats, factors: Any) -> Floats:
         """(h, w, 2) standard deviation of the velocity, where the observations have weights (n,)."""
         rng = np.random.default_rng(0)
         square = np.zeros(self.unknowns)
@@ -166,12 +168,13 @@ class _LeastSquares:
         along, across = (push_x * vx + push_y * vy) / size, (push_y * vx - push_x * vy) / size
         z = np.array([[mass * vx / size, mass * vy / size], [along, -across], [across, along]])  # (3, 2, h, w)
         blocks = [
-            [sp.diags_array(z[r, c].ravel()) for c in range(2)] + [sp.csr_array((h * w, h * w))] for r in range(3)
+            [scipy.sparse.diags_array(z[r, c].ravel()) for c in range(2)] + [scipy.sparse.csr_array((h * w, h * w))]
+            for r in range(3)
         ]
-        self.drag = sp.block_array(blocks).tocsr()
+        self.drag = scipy.sparse.block_array(blocks).tocsr()
         self.rest = np.stack([mass, push_x, push_y]).ravel() - self.drag @ self.start
 
-    def _equations(self, speed: Floats, floor: float, change: Floats) -> tuple[sp.csr_array, Floats]:
+    def _equations(self, speed: Floats, floor: float, change: Floats) -> tuple[scipy.sparse.csr_array, Floats]:
         """Weighted continuity and momentum on the pixels inside, linearised around a change of the initial field."""
         full = self.start + self.embed @ change
         jacobian = self.physics.jacobian(_tensor(full.reshape(3, *self.fluid.shape)))
@@ -183,9 +186,9 @@ class _LeastSquares:
         weight = (weight * (self.case.inside & self.fluid)).ravel()
         used = np.flatnonzero(weight > 0.0)
         slope, weight = slope[used], weight[used]
-        return sp.diags_array(weight) @ slope, weight * (slope @ change - residual[used])
+        return scipy.sparse.diags_array(weight) @ slope, weight * (slope @ change - residual[used])
 
-    def _prior(self, speed: Floats, floor: float) -> sp.csr_array:
+    def _prior(self, speed: Floats, floor: float) -> scipy.sparse.csr_array:
         """Prior of the change: small and smooth, with the profiles at openings nearly as assumed."""
         rows = _Rows(self.unknowns)
         each = np.arange(len(self.which))[:, None]
@@ -230,8 +233,10 @@ class _LeastSquares:
     def _local_rms(self, velocity: Floats) -> Floats:
         """(h, w) root mean square of the speed of (h, w, 2) around each pixel, without pixels at walls."""
         free = (self.fluid & ~self.case.walled).astype(np.float64)
-        square = uniform_filter((velocity**2).sum(axis=-1) * free, 5, mode="constant")
-        return np.asarray(np.sqrt(np.maximum(square, 0.0) / np.maximum(uniform_filter(free, 5, mode="constant"), 0.04)))
+        square = scipy.ndimage.uniform_filter((velocity**2).sum(axis=-1) * free, 5, mode="constant")
+        return np.asarray(
+            np.sqrt(np.maximum(square, 0.0) / np.maximum(scipy.ndimage.uniform_filter(free, 5, mode="constant"), 0.04))
+        )
 
     def _residual(self, full: Floats) -> Floats:
         """(3, h, w) of velocities and pressures (3 h w,)."""

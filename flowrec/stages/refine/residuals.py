@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its sparse loads at first use, not at start-up
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -130,7 +130,7 @@ class Physics:
         inside = functional.conv2d(p, self.kernels[axis], padding=1) + 0.5 * (after - before) * p
         return inside * 2.0 / (2.0 - after - before).clamp(min=1.0) * (after + before < 2.0)
 
-    def jacobian(self, image: Tensor) -> sp.csr_array:
+    def jacobian(self, image: Tensor) -> scipy.sparse.csr_array:
         """(3 h w, 3 h w) derivative of the residuals of one mask around an image (1, 3, h, w) of vx, vy, p.
 
         The equations are quadratic, so central differences with any step are exact; a viscosity that depends on the
@@ -160,4 +160,4 @@ class Physics:
                 rows = equation * h * w + pixel[here][y, x]
                 parts.append((values[y, x, equation], rows, channel * h * w + pixel[varied][y, x]))
         data, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return sp.csr_array((data, (rows, columns)), shape=(3 * h * w, 3 * h * w))
+        return scipy.sparse.csr_array((data, (rows, columns)), shape=(3 * h * w, 3 * h * w))

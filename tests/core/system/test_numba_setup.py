@@ -56,7 +56,7 @@ def package(tmp_path: Path) -> Path:
     return copy
 
 
-TWICE = "from flowrec.outer import twice; print(twice(), sum(twice.stats.cache_hits.values()))"
+TWICE = "from flowrec.outer import twice; print(twice(), sum(twice.dispatcher.stats.cache_hits.values()))"
 
 
 @pytest.mark.slow("compiles kernels in processes of its own")
