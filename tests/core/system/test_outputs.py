@@ -160,6 +160,8 @@ def test_the_rrd_beside_a_session_is_made_anew_only_where_it_was_made_from_that_
     assert flowrec("export", session)[0] == 0
     made = rrd.read_bytes()
     assert flowrec("view", session, "--no-open")[0] == 0
+    assert rrd.read_bytes() == made
+    assert flowrec("export", session)[0] == 0
     assert rrd.read_bytes() != made
     assert flowrec("export", folder / "parts.part001.mcap")[0] == 0
     for foreign in (b"notes of a person", (folder / "parts.part001.rrd").read_bytes()):
