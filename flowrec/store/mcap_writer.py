@@ -247,5 +247,9 @@ def _disk_failed(path: Path, error: OSError) -> FileError:
         return FileError(
             f"{path}: no longer exists: the file or its directory was removed or renamed during the recording"
         )
-    what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
-    return FileError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")
+    what, first = f"writing failed ({error.strerror})", "see to the disk and its connection"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        what, first = "the disk is full", "free some space"
+    elif error.errno == errno.EFBIG:
+        what, first = "no file may be larger here", "record in parts (recording.split_mb)"
+    return FileError(f"{path}: {what}; {first}, then `flowrec recover {path}` saves what was recorded")

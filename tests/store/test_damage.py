@@ -88,12 +88,16 @@ def test_a_name_taken_during_the_run_is_not_overwritten(tmp_path):
     assert SessionReader(writer.partial_path).outcome["outcome"] == "ended"
 
 
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [(errno.ENOSPC, "the disk is full; free some space, then"), (errno.EIO, r"failed \(Input/output error\); see to")],
+)
 @pytest.mark.parametrize("block", [True, False])
-def test_a_full_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatch, block):
+def test_a_full_or_broken_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatch, block, number, told):
     writer = SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(flush_s=0.0, block=block, queue_limit_bytes=2000))
 
     def refuse(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(McapWriter, "add_chunks", refuse)
 
@@ -103,7 +107,7 @@ def test_a_full_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatc
             time.sleep(0.001)
 
     for call in (fly, writer.close):
-        with pytest.raises(SessionError, match="the disk is full") as error:
+        with pytest.raises(SessionError, match=told) as error:
             call()
         one_line(error)
     assert not writer.path.exists() and writer.partial_path.exists()
