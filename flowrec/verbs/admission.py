@@ -18,9 +18,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flowrec.core import (
     MCAP,
+    BoundedProcess,
     FlowField,
+    FlowrecError,
     Output,
     Progress,
     RigError,
@@ -213,6 +217,7 @@ def _trial(
 # Seconds of session: survey, refinement, plan and the way to the goal take seven. One that gets lost ends here.
 LENGTH_S = 15.0
 _ADOPT_AFTER_S = 0.1
+_HELP_S = 600.0  # of CPU time, at most
 _SETTINGS = {
     "chip.name": "straight",
     "camera.width_px": 96,
@@ -255,7 +260,16 @@ def rehearse(config: Config, stopped: Callable[[], object] = lambda: False, prog
             control.stop("stopped")
 
     worker = LockstepWorker(pipeline, _ADOPT_AFTER_S)
-    run(pipeline, SimulatedRig.of(pipeline, resolved, LENGTH_S), worker, [], control=control, on_tick=on_tick)
+    with BoundedProcess("kernels", _HELP_S, error=FlowrecError) as helper:
+        if not kernels_cached():  # two processors compile in two thirds of the time
+            helper.begin(_plan, resolved, chip)
+        run(pipeline, SimulatedRig.of(pipeline, resolved, LENGTH_S), worker, [], control=control, on_tick=on_tick)
+
+
+def _plan(config: ResolvedConfig, chip: Chip) -> None:
+    """Plan the way of the rehearsal, in another process, which leaves the kernels of planning in the cache."""
+    start_um, goal_um = np.array(config.mission.start, np.float64), np.array(config.mission.goal, np.float64)
+    config.plan.plan(config.flow.solve(chip), start_um, goal_um, chip, config.robot)
 
 
 def rehearse_aloud(config: Config, control: Unattended) -> None:

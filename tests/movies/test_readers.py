@@ -13,7 +13,7 @@ import tifffile
 import zstandard
 
 from flowrec.core.errors import MovieError
-from flowrec.movies import ReadOptions, open_movie
+from flowrec.movies import ReadOptions, ome, open_movie
 from flowrec.rigs.movie.rig import MovieRig
 from flowrec.rigs.movie.source import MovieSource
 from flowrec.stages.config import MovieSettings
@@ -300,6 +300,22 @@ def test_what_a_header_declares_is_not_believed(tmp_path):
     with pytest.raises(MovieError, match=r"image 5 holds nothing but 0: .* --partial takes the 5"):
         read(tmp_path / "part.zarr")
     assert len(read(tmp_path / "part.zarr", partial=True)[1]) == 5
+
+
+HOUR = {"s": 3600, "ms": 3.6e6, "\u00b5s": 3.6e9, "\u03bcs": 3.6e9, "us": 3.6e9, "ns": 3.6e12, "min": 60, "h": 1}
+HOUR |= {"second": 3600, "millisecond": 3.6e6, "microsecond": 3.6e9, "nanosecond": 3.6e12, "minute": 60, "hour": 1}
+METRE = {"\u00b5m": 1e6, "\u03bcm": 1e6, "um": 1e6, "micron": 1e6, "nm": 1e9, "mm": 1e3, "cm": 100, "m": 1}
+METRE |= {"micrometer": 1e6, "nanometer": 1e9, "millimeter": 1e3, "centimeter": 100, "meter": 1}
+
+
+def test_every_unit_that_ome_states_has_its_length():
+    assert set(ome._S_PER) == set(HOUR) and set(ome._UM_PER) == set(METRE)
+    assert {unit: ome.seconds_per(unit) * length for unit, length in HOUR.items()} == pytest.approx(
+        dict.fromkeys(HOUR, 3600.0)
+    )
+    assert {unit: ome.um_per(unit) * length for unit, length in METRE.items()} == pytest.approx(
+        dict.fromkeys(METRE, 1e6)
+    )
 
 
 def test_a_series_of_several_ome_files_is_one_movie(tmp_path):

@@ -1,4 +1,4 @@
-"""A pump that pulses."""
+"""A pump that pulses, and one that drifts."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 from flowrec.core.messages import FlowField
 from flowrec.physics.robot import Robot
 from flowrec.rigs.simulated.bodies import Swimmer
+from flowrec.rigs.simulated.pump import Pump
 from flowrec.stages.simulated_settings import Simulated
 
 
@@ -30,3 +31,10 @@ def test_a_pulsating_flow_swings_about_the_steady_one_and_carries_as_far() -> No
     assert max(speeds) == pytest.approx(150.0, rel=0.02)
     assert min(speeds) == pytest.approx(50.0, rel=0.02)
     np.testing.assert_allclose(pulsating.position_um, steady.position_um, atol=0.2)
+
+
+def test_the_flow_of_a_drifting_pump_is_on_average_that_of_the_map_it_is_judged_by() -> None:
+    pump = Pump(0.0, 1.0, 0.0, 0.1, 20.0, np.random.default_rng(4))
+    strengths = [pump.strength(0.5 * step) for step in range(60)]
+    assert np.std(strengths) > 0.02
+    assert pump.mean_drift(30.0) == pytest.approx(np.mean(strengths), abs=1e-12)

@@ -68,6 +68,11 @@ class BoundedProcess:
         result: Answer = answer
         return result
 
+    def begin(self, function: Callable[..., object], *given: Any) -> None:
+        """Have a function called of which only an effect is wanted, such as a filled cache: nobody waits for it."""
+        self._child = self._child or self._start_child()
+        self._child.send((self._cpu_s, self._memory_bytes, function, given))
+
     def close(self) -> None:
         """End the child at once."""
         if self._child is not None:

@@ -11,6 +11,7 @@ import pytest
 from flowrec.core.errors import MovieError, UsageError
 from flowrec.core.system.bounded_process import BoundedProcess
 from flowrec.core.system.toml_file import read_toml
+from tests.conftest import until
 
 
 def test_a_result_comes_back_and_the_next_call_finds_the_same_process():
@@ -52,6 +53,12 @@ def test_a_reader_that_crashes_takes_nobody_with_it():
 def test_a_reader_that_the_system_kills_was_short_of_memory():
     with BoundedProcess("a.bin", 10.0) as process, pytest.raises(UsageError, match=r"^a\.bin: needs more than"):
         process.call(signal.raise_signal, signal.SIGKILL)
+
+
+def test_what_nobody_waits_for_is_done_beside_and_ends_with_the_process(tmp_path):
+    with BoundedProcess("a.bin", 10.0) as process:
+        process.begin(os.mkdir, tmp_path / "made")
+        until((tmp_path / "made").exists)
 
 
 def test_nothing_is_left_running_once_it_is_closed():
