@@ -33,3 +33,12 @@ def test_a_table_has_a_row_for_each_image_and_none_more(frames: int, tmp_path: P
         frame_times(MOVIE, facts(frames), str(table))
     assert frame_times(MOVIE, facts(3), str(table)).of(2, None, MOVIE) == (200_000_000, 2)
     assert frame_times(MOVIE, facts(frames, counted=False), str(table)).exact, "an estimated number refuses nothing"
+
+
+@pytest.mark.parametrize("numbers", ["-1 1 2", "0 1 1", "0 2 1", "0 1.5 2", "0 1 1e15"])
+def test_frame_numbers_are_whole_not_negative_and_increase(numbers: str, tmp_path: Path) -> None:
+    table = tmp_path / "times.csv"
+    rows = [f"{number},{0.1 * row}" for row, number in enumerate(numbers.split())]
+    table.write_text("\n".join(["frame,time_s", *rows]))
+    with pytest.raises(MovieError, match=r"line [234]: frame numbers are whole, and increase; correct that line"):
+        frame_times(MOVIE, facts(3), str(table))

@@ -39,9 +39,12 @@ def swum(
     step_out_hz: float,
     wanted_hz: float = 24.0,
     wall_um: float = math.inf,
+    later_hz: float | None = None,
 ) -> list[Health]:
-    """Health on a straight way against a flow: the field turns as fast as wanted and allowed, the robot as it can."""
-    true_robot = replace(ROBOT, step_out_hz=step_out_hz)
+    """Health on a straight way against a flow: the field turns as fast as wanted and allowed, the robot as it can.
+
+    `later_hz` is its step-out from 3 s on.
+    """
     rng = np.random.default_rng(3)
     at, found, before = np.array([4000.0, 80.0]), list[Health](), None
     for index in range(round(seconds / DT_S)):
@@ -49,6 +52,7 @@ def swum(
         limit_hz = found[-1].limit_hz if found and found[-1].limit_hz is not None else math.inf
         frequency = min(wanted_hz, limit_hz)
         turns = np.array([-frequency * DT_S, 0.0])
+        true_robot = replace(ROBOT, step_out_hz=later_hz if later_hz and index * DT_S >= 3.0 else step_out_hz)
         at = at + DT_S * np.array([true_um_s - true_robot.rolled_speed_um_s(frequency), 0.0])
         seen = at + rng.normal(0.0, 1.0, 2)
         estimate = Estimate(stamp, seen, np.zeros(2), np.eye(4), 2.0, seen, True)
@@ -96,6 +100,13 @@ def test_a_limit_that_does_not_help_is_lifted_and_not_tried_again_at_once() -> N
     told = [event_of(Tick(k - 1, health=found[k - 1]), Tick(k, health=found[k])) for k in (lowered, lifted)]
     assert told[0] is not None and told[0].level == "warning" and f"limited to {seen[1]:.1f} Hz" in told[0].text
     assert told[1] is not None and "no step-out" in told[1].text
+
+
+def test_a_robot_that_steps_out_at_ever_lower_frequencies_is_slowed_down_each_time_at_once() -> None:
+    found = swum(6.0, 0.0, 0.0, step_out_hz=0.7 * 24.0, later_hz=0.55 * 24.0)
+    none, first, last = limits(found)
+    assert none is None and first is not None and last is not None and last < 0.9 * first
+    assert next(each.stamp_ns for each in found if each.limit_hz == last) < 4e9  # 10 s after one that did not help
 
 
 def test_a_slow_field_says_nothing_of_step_out() -> None:
