@@ -28,6 +28,22 @@ def after_a_frame(controller, route, position, field, robot=ROBOT, strength=1.0,
     return controller.control(first, mission(), route, later, field, robot, None, 50.0, strength)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_away_from_the_cut_of_angles_the_law_is_that_of_the_paper(seed):
+    rng = np.random.default_rng(seed)
+    wanted, flow = rng.uniform(100.0, 300.0, 2), rng.uniform(-50.0, 50.0, 2)
+    error, dt_s, gain_per_s = rng.uniform(5.0, 40.0, 2), 1 / 30, 3.0
+    e = error - flow * dt_s
+    course = np.arctan2(*wanted[::-1])
+    along, across = np.abs(np.array([[np.cos(course), np.sin(course)], [-np.sin(course), np.cos(course)]]) @ e)
+    headings = np.arctan2(*(wanted - flow)[::-1]), np.arctan2(*e[::-1])
+    heading = (along * headings[0] + across * headings[1]) / (along + across)
+    speed = np.hypot(*(wanted - flow)) + gain_per_s * (e[0] * np.cos(heading) + e[1] * np.sin(heading))
+    for kind in (FeedforwardFeedback, LiteralFeedforwardFeedback):
+        demand = kind(gain_per_s).law(error, wanted, flow, dt_s)
+        np.testing.assert_allclose(demand, speed * np.array([np.cos(heading), np.sin(heading)]))
+
+
 def test_as_printed_the_mean_of_two_headings_near_180_degrees_points_the_other_way():
     moving, still = np.array([-300.0, 0.0]), np.zeros(2)
     ahead = np.array([-300.0, 0.1])  # pi less a little, while the error points to -pi and a little
