@@ -6,6 +6,9 @@ import torch
 
 from flowrec.physics.flow.sampling import sample
 from flowrec.stages.refine import PiUnet, Refiner
+from flowrec.stages.refine.method import RefinementProblem
+from flowrec.stages.refine.observation_operator import observation_operator
+from flowrec.stages.refine.pi_unet import HELD_OUT, Correction
 from flowrec.stages.refine.residuals import Physics
 
 
@@ -73,6 +76,60 @@ def test_a_closed_branch_is_found_by_the_assimilation_and_pi_unet_does_not_make_
     assert case.error(refined) <= 1.02 * case.error(assimilated)
     score = (refined.velocity_um_s - real.velocity_um_s)[mask] / refined.std_um_s[mask]
     assert np.mean(np.abs(score) < 2.0) > 0.9
+
+
+def corrected(case, monkeypatch, fields, std=None, **settings):
+    """The result of PI-UNet where the network gives these fields, all with the pressure 7 Pa; `std` is of the last."""
+    found = [Correction("made up", each, np.full(each.shape[:2], 7.0)) for each in fields]
+    found[-1] = replace(found[-1], std_um_s=std)
+    monkeypatch.setattr(PiUnet, "corrections", lambda *_: found)
+    operator = observation_operator(case.observations, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
+    stated = replace(case.assumed, std_um_s=np.full_like(case.assumed.velocity_um_s, 3.0))
+    problem = RefinementProblem(case.assumed, operator, case.chip, case.solver, lambda _: (stated, operator))
+    return PiUnet(**settings).fit(problem)
+
+
+def test_of_two_corrections_the_balanced_one_is_taken_and_the_networks_where_that_predicts_worse(twin, monkeypatch):
+    case = twin()
+    halfway = 0.5 * (case.assumed.velocity_um_s + case.true.velocity_um_s)
+    std = np.full_like(halfway, 2.0)
+    best = corrected(case, monkeypatch, [halfway, case.true.velocity_um_s], std, start="fvm")
+    np.testing.assert_allclose(best.velocity_um_s, case.true.velocity_um_s, atol=1e-3)
+    assert np.all(best.std_um_s == 2.0) and np.all(best.pressure_pa == 7.0) and "% of it" not in best.note
+    network = corrected(case, monkeypatch, [halfway, 2.0 * case.true.velocity_um_s], std, start="fvm")
+    np.testing.assert_allclose(network.velocity_um_s, halfway, atol=1e-3)
+    assert network.std_um_s is None
+    kept = corrected(case, monkeypatch, [2.0 * halfway, 2.0 * halfway], std, start="fvm")
+    assert "start kept, a correction did not predict" in kept.note and kept.std_um_s is None
+
+
+def test_a_correction_is_judged_by_observations_that_it_has_not_used(twin, monkeypatch):
+    case = twin()
+    field = case.true.velocity_um_s.copy()
+    for place_um in case.observations.position_um[HELD_OUT // 2 :: HELD_OUT]:
+        column, row = np.rint(place_um / case.chip.um_per_px).astype(int)
+        field[row - 1 : row + 2, column - 1 : column + 2] *= -1.0
+    assert "did not predict" in corrected(case, monkeypatch, [field], start="fvm").note
+
+
+def test_of_a_correction_of_what_is_nearly_noise_a_part_is_taken_and_the_rest_is_in_the_error_bar(twin, monkeypatch):
+    case = twin(noise=0.3, truth=(118.0, 0.0, 0.0), seed=1)
+    std = np.full_like(case.true.velocity_um_s, 2.0)
+    part = corrected(case, monkeypatch, 2 * [case.true.velocity_um_s], std, start="fvm")
+    assert "50% of it" in part.note
+    change = case.true.velocity_um_s - case.assumed.velocity_um_s
+    np.testing.assert_allclose(part.velocity_um_s, case.assumed.velocity_um_s + 0.5 * change, atol=1e-3)
+    np.testing.assert_allclose(part.std_um_s, np.hypot(1.0, 0.5 * change), rtol=1e-5)
+    np.testing.assert_allclose(part.pressure_pa, 0.5 * (case.assumed.pressure_pa + 7.0), rtol=1e-5)
+
+
+def test_a_start_with_error_bars_stays_within_those_of_its_correction(twin, monkeypatch):
+    case = twin()
+    result = corrected(case, monkeypatch, [case.true.velocity_um_s])
+    change = case.true.velocity_um_s - case.assumed.velocity_um_s
+    np.testing.assert_allclose(result.std_um_s, np.hypot(3.0, change), rtol=1e-4)
+    power = np.sqrt((result.std_um_s**2).sum() / (result.velocity_um_s**2).sum())
+    assert result.error_share == pytest.approx(power, rel=1e-5)
 
 
 @pytest.mark.slow("fits a network")
