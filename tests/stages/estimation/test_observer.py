@@ -325,6 +325,20 @@ def test_a_flow_that_no_robot_could_be_held_in_is_not_believed_for_longer_than_a
     assert np.linalg.norm(after.position_um - track.position_um) < 5.0
 
 
+def test_the_luenberger_observer_is_the_papers_filter_and_goes_on_by_its_flow_where_the_robot_is_not_seen() -> None:
+    """vhat' = L (x' - xhat') for a robot that swims and drifts steadily: vhat = v (1 - exp(-L t)) at any rate."""
+    observer, flow, own = Luenberger(2.0), np.array([80.0, -30.0]), np.array([15.0, 40.0])
+    estimate, at = None, np.array([500.0, 400.0])
+    for index in range(21):
+        estimate = observer.estimate(estimate, track(index, at), applied(index, own / RATE_HZ), ROBOT)
+        at = at + (flow + own) / RATE_HZ
+    assert estimate is not None
+    np.testing.assert_allclose(estimate.flow_um_s, flow * (1.0 - math.exp(-2.0 * 20 / RATE_HZ)))
+    blind = observer.estimate(estimate, track(21, at + 100.0, seen=False), applied(21, own / RATE_HZ), ROBOT)
+    np.testing.assert_allclose(blind.flow_um_s, estimate.flow_um_s)
+    np.testing.assert_allclose(blind.position_um - estimate.position_um, (own + estimate.flow_um_s) / RATE_HZ)
+
+
 @pytest.mark.parametrize(
     "gain_per_s", [1.0, pytest.param(20.0, marks=pytest.mark.slow("many flights, with another gain"))]
 )
