@@ -19,8 +19,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
 from flowrec.core import (
     ChildProcess,
+    FlowField,
     Priority,
     SessionError,
     TopicTable,
@@ -173,7 +176,11 @@ def _work() -> None:
 
 def _work_beside(recorder: Recorder, queue: QueueReader) -> None:
     """Load what draws the file, which takes a second, before the run has ended; tell the size of the files."""
-    from flowrec.physics import sample  # noqa: F401
+    from flowrec.physics import sample
+
+    still = FlowField(0, 0, "", 1.0, np.zeros((2, 2, 2)), np.zeros((2, 2)), None, [0.0], 1.0, 1.0, "")
+    for places in ((0.0, 0.0), np.zeros((1, 2))):
+        sample(still, places)  # by kernels, which are loaded now
 
     while True:
         queue.note_files_bytes(recorder.size)
