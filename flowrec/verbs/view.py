@@ -90,7 +90,7 @@ def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: 
         return session, []
     from flowrec.exports import kept_rrd
 
-    kept = kept_rrd(session, out, beside)
+    kept = None if overwrite else kept_rrd(session, out, beside)
     if kept is not None:
         return kept, [f"{kept} is as it was made of this session"]
     return export(session, out, overwrite, beside=beside), []

@@ -200,12 +200,12 @@ def test_view_keeps_the_recording_of_an_unchanged_session_and_writes_that_of_a_c
     path.write_bytes(brief.read_bytes())
     rrd = path.with_suffix(".rrd")
 
-    def written_anew() -> bool:
+    def written_anew(overwrite: bool = False) -> bool:
         before_ns = rrd.stat().st_mtime_ns if rrd.exists() else 0
-        view(path, no_open=True)
+        view(path, no_open=True, overwrite=overwrite)
         return rrd.stat().st_mtime_ns != before_ns
 
-    assert written_anew() and not written_anew()
+    assert written_anew() and not written_anew() and written_anew(overwrite=True)
     os.utime(path)  # as if it were another one of that size
     assert written_anew() and not written_anew()
     rrd.write_bytes(rrd.read_bytes()[:-100])
