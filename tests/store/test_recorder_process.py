@@ -90,6 +90,17 @@ def test_a_part_begins_with_the_last_image_before_it_whatever_its_memory_is_used
     assert repeated == len(writer.files) - 1 > 5
 
 
+@pytest.mark.parametrize("own", [True, False])
+def test_an_image_larger_than_what_may_wait_is_recorded_where_nothing_waits(tmp_path, own):
+    options = WriterOptions(own_process=own, frames="raw", queue_limit_bytes=1000)
+    with SessionWriter(tmp_path / "x.mcap", HEADER, options) as writer:
+        for tick in TICKS[:5]:
+            assert tick.frame.image.nbytes > 1000
+            until(lambda: not writer.queue_bytes)
+            writer.write(tick)
+    assert writer.dropped_frames == 0
+
+
 def test_what_can_not_be_made_is_refused_before_the_run_and_a_discarded_run_leaves_no_file(tmp_path):
     with pytest.raises(SessionError, match="no such directory"):
         SessionWriter(tmp_path / "nowhere" / "x.mcap", HEADER, OWN)
