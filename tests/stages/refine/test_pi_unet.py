@@ -39,6 +39,20 @@ def test_the_discrete_equations_vanish_on_poiseuille_flow():
     assert wrong[1, 5:-5].abs().max() > 1.9 / 10**2
 
 
+def test_the_discrete_equations_vanish_on_a_stagnation_flow_and_a_shallow_chip_adds_its_drag():
+    """v = (x, -y): (v . grad) v = (x, y), which the pressure -Re (x^2 + y^2) / 2 balances; no viscous force."""
+    y, x = (axis - 7.5 for axis in np.mgrid[0:16, 0:16].astype(float))
+    velocity = torch.tensor(np.stack([x, -y])[None], dtype=torch.float32)
+    pressure = torch.tensor((-1.5 * (x**2 + y**2))[None, None], dtype=torch.float32)
+    fluid, inside = torch.ones_like(pressure), torch.zeros_like(pressure)
+    inside[..., 2:-2, 2:-2] = 1.0
+    found = [Physics.of(fluid, inside, reynolds=3.0, friction=f).residuals(velocity, pressure)[0] for f in (0.0, 0.2)]
+    within = np.s_[:, 3:-3, 3:-3]
+    assert found[0][within].abs().max() < 1e-4
+    drag = torch.cat([torch.zeros_like(velocity[0, :1]), 0.2 * velocity[0]])
+    assert (found[1] - drag)[within].abs().max() < 1e-4
+
+
 @pytest.mark.slow("trains a network")
 def test_pi_unet_lowers_the_error_of_a_wrong_solution_by_a_third(twin):
     case = twin()
