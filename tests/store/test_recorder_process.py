@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 
@@ -88,6 +89,23 @@ def test_a_part_begins_with_the_last_image_before_it_whatever_its_memory_is_used
             repeated += 1
         last = frames[-1]
     assert repeated == len(writer.files) - 1 > 5
+
+
+def test_whoever_waits_for_a_flush_goes_on_at_the_very_stamp_that_was_flushed():
+    queue, (read, write) = shared_queue.SharedQueue(1 << 20, images=False), os.pipe()
+    queue.wake_by(write)
+    recorder = shared_queue.QueueReader(queue.handles, read)
+    for stamp_ns in (0, 1, 5):  # a session may begin at 0
+        waiting = threading.Thread(target=queue.wait_for_flush, args=(stamp_ns,), daemon=True)
+        waiting.start()
+        until(lambda: recorder.flush_wanted)
+        recorder.mark_flushed(stamp_ns - 1)
+        assert waiting.is_alive()
+        recorder.mark_flushed(stamp_ns)
+        waiting.join(HANG_S)
+        assert not waiting.is_alive() and not recorder.flush_wanted
+    os.close(read)
+    os.close(write)
 
 
 @pytest.mark.parametrize("own", [True, False])
