@@ -256,11 +256,15 @@ def test_a_disk_that_is_full_ends_the_run_with_its_reason_and_what_was_written_i
     assert recover(writer.partial_path).ticks > 10
 
 
-def test_a_run_whose_images_are_given_up_counts_them(tmp_path):
-    writer = SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(own_process=True, frames="raw"))
+@pytest.mark.parametrize("waiting", [60, 20])  # of 60 images; the others are dropped before
+def test_a_run_whose_images_are_given_up_counts_them(tmp_path, waiting):
+    limit = round((waiting + 0.5) * TICKS[0].frame.image.nbytes) + (1 << 18 if waiting == 60 else 0)
+    options = WriterOptions(own_process=True, frames="raw", queue_limit_bytes=limit)
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, options)
     os.kill(recorder_of(writer), signal.SIGSTOP)
     for tick in TICKS:
         writer.write(tick)
+    assert (writer.dropped_frames > 20) == (waiting == 20)
     timer = subprocess.Popen(["sh", "-c", f"sleep 0.5; kill -CONT {recorder_of(writer)}"])
     writer.close(timeout_s=0.05)
     timer.wait()

@@ -6,8 +6,11 @@ import torch
 
 from flowrec.physics.flow.sampling import sample
 from flowrec.stages.refine import PiUnet, Refiner
+from flowrec.stages.refine.case import Case
 from flowrec.stages.refine.method import RefinementProblem
-from flowrec.stages.refine.observation_operator import observation_operator
+from flowrec.stages.refine.network_fit import FieldLoss
+from flowrec.stages.refine.network_inputs import NetworkInputs
+from flowrec.stages.refine.observation_operator import observation_operator, student_t_loss
 from flowrec.stages.refine.pi_unet import HELD_OUT, Correction
 from flowrec.stages.refine.residuals import Physics
 
@@ -51,6 +54,30 @@ def test_the_discrete_equations_vanish_on_a_stagnation_flow_and_a_shallow_chip_a
     assert found[0][within].abs().max() < 1e-4
     drag = torch.cat([torch.zeros_like(velocity[0, :1]), 0.2 * velocity[0]])
     assert (found[1] - drag)[within].abs().max() < 1e-4
+
+
+def test_the_loss_is_the_squared_residual_beyond_the_starts_and_the_likelihood_of_the_observations(twin):
+    made = twin()
+    assumed = made.assumed
+    operator = observation_operator(made.observations, made.chip.mask, made.chip.um_per_px, assumed.wall_px)
+    case = Case.of(assumed, operator, made.chip)
+    inputs = NetworkInputs.of([case])
+    deep = -torch.nn.functional.max_pool2d(-inputs.fluid * inputs.inside, 5, 1, 2)
+    push = torch.zeros_like(inputs.pressure)
+    push.view(-1)[int(deep.argmax())] = 1.0
+
+    def loss(size, **settings):
+        changed = inputs.velocity, inputs.pressure + size * push
+        return FieldLoss(inputs, case, PiUnet(**settings), lambda _: changed)(push)
+
+    start = float(loss(0.0)[0])
+    assert start == pytest.approx(2.0 * 0.03 * student_t_loss(operator.misfit(assumed.velocity_um_s)), rel=1e-3)
+    once, twice = (float(loss(size)[0]) - start for size in (1.0, 2.0))
+    assert once > 0.0 and twice == pytest.approx(4.0 * once, rel=1e-3)
+    hard = loss(0.0, observations="hard")[2][0, :2]
+    measured = inputs.observed[0, 0] > 0.0
+    moved = (hard - inputs.velocity[0])[:, measured]
+    assert measured.sum() > 10 and torch.allclose(moved, inputs.innovation[0][:, measured], atol=0.03)
 
 
 @pytest.mark.slow("trains a network")
