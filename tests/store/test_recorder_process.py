@@ -245,6 +245,42 @@ def test_a_recorder_that_stands_still_costs_no_tick_and_delays_no_write(tmp_path
     assert longest_s < 0.1  # of CPU time: it has not waited for room in a loop
 
 
+def test_a_run_that_waits_for_its_recorder_ends_when_that_is_killed(tmp_path):
+    writer, failures = SessionWriter(tmp_path / "x.mcap", HEADER, replace(OWN, flush_s=0.05)), []
+    os.kill(recorder_of(writer), signal.SIGSTOP)
+
+    def run():
+        try:
+            write_all(writer, ticks_of(1000))
+        except SessionError as error:
+            failures.append(error)
+
+    waiting = threading.Thread(target=run, daemon=True)
+    waiting.start()
+    until(lambda: writer._queue._state.words[1])  # it waits for a flush
+    os.kill(recorder_of(writer), signal.SIGKILL)
+    waiting.join(HANG_S)
+    assert "its recorder has ended (killed by SIGKILL)" in str(failures[0])
+    with pytest.raises(SessionError, match="killed by SIGKILL"):
+        writer.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_recorder_ends_with_its_run_and_by_no_signal_that_asks_it_to(tmp_path, number):
+    with SessionWriter(tmp_path / "x.mcap", HEADER, OWN) as writer:
+        for tick in TICKS:
+            writer.write(tick)
+            os.kill(recorder_of(writer), number)
+    with SessionReader(tmp_path / "x.mcap") as file:
+        assert file.counts["frame"] == len(TICKS)
+
+
+def test_the_recorder_gives_way_to_a_run_that_waits_for_it_and_to_no_live_one(tmp_path):
+    for block in (True, False):
+        with SessionWriter(tmp_path / f"{block}.mcap", HEADER, replace(OWN, block=block)) as writer:
+            assert (os.getpriority(os.PRIO_PROCESS, recorder_of(writer)) > 0) == block
+
+
 def test_a_disk_that_is_full_ends_the_run_with_its_reason_and_what_was_written_is_recovered(tmp_path):
     path = tmp_path / "x.mcap"
     writer = SessionWriter(path, HEADER, WriterOptions(own_process=True, flush_s=0.05))
