@@ -17,7 +17,7 @@ import pytest
 from flowrec.core.errors import SessionError
 from flowrec.core.messages import OperatorEvent
 from flowrec.core.units import NS_PER_S
-from flowrec.store import shared_queue
+from flowrec.store import recorder_process, shared_queue
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.run_files import files_of
@@ -263,6 +263,21 @@ def test_a_run_that_waits_for_its_recorder_ends_when_that_is_killed(tmp_path):
     assert "its recorder has ended (killed by SIGKILL)" in str(failures[0])
     with pytest.raises(SessionError, match="killed by SIGKILL"):
         writer.close()
+
+
+def test_a_recorder_that_writes_nothing_for_long_is_told_and_completes_the_file_when_it_can(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_process, "_SILENT_S", 0.5)
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, OWN)
+    for tick in TICKS:
+        writer.write(tick)
+    os.kill(recorder_of(writer), signal.SIGSTOP)
+    with pytest.raises(SessionError, match=r"its recorder \(process \d+\) has written nothing for 0\.5 s"):
+        writer.close()
+    os.kill(recorder_of(writer), signal.SIGCONT)
+    until((tmp_path / "x.mcap").exists)
+    writer._recorder.wait(HANG_S)
+    with SessionReader(tmp_path / "x.mcap") as file:
+        assert file.counts["frame"] == len(TICKS)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

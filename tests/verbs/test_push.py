@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
-from flowrec.archive.push import push
+from flowrec.archive.push import PushedFile, push
 from flowrec.core.errors import FlowrecError, UsageError
 from flowrec.store import bucket_upload, remote_file, traffic
 from flowrec.store.run_files import part_path, session_sha256
@@ -376,3 +376,16 @@ def test_two_sessions_of_one_name_are_refused(tmp_path: Path) -> None:
     (other := tmp_path / SESSION.name).write_bytes(SESSION.read_bytes())
     with pytest.raises(UsageError, match="has the name of"):
         push([SESSION, other], TARGET)
+
+
+@pytest.mark.parametrize(
+    ("sent", "told"),
+    [
+        (3_000_000, "3.0 MB sent, compared"),
+        (1_000_000, "3.0 MB sent, 1.0 MB of them now, c"),
+        (0, "is there already"),
+    ],
+)
+def test_what_was_sent_by_an_earlier_call_is_told_apart(tmp_path: Path, sent: int, told: str) -> None:
+    file = PushedFile(tmp_path / "a.mcap", UrlPath("s3://lab/a.mcap"), 3_000_000, sent, "", "by reading all of it")
+    assert told in str(file)

@@ -272,6 +272,15 @@ def test_a_long_curve_is_thinned_to_its_range_and_gaps_and_nan_interrupt_it() ->
     assert 500.0 < curve.time_s[np.isnan(curve.mean)][0] < 600.0
 
 
+def test_a_point_of_a_thinned_curve_is_the_mean_of_its_values() -> None:
+    builder = CurveBuilder(0, 1_000_000_000, buckets=2)
+    for place, value in ((0, 1.0), (100, 2.0), (200, 6.0), (700, -4.0)):
+        builder.add(place * 1_000_000, value)
+    curve = builder.curve()
+    assert curve.known.tolist() == pytest.approx([3.0, -4.0])
+    assert curve.time_s[np.isfinite(curve.mean)].tolist() == pytest.approx([0.1, 0.7])
+
+
 def test_every_outcome_has_a_sentence_and_every_meaning_belongs_to_a_figure_of_a_run() -> None:
     assert set(OUTCOMES) == set(Outcome)
     assert set(flowrec.open(MODERATE).outcome) - {"outcome", "note"} - command._HIDDEN <= set(MEANINGS)
