@@ -178,7 +178,8 @@ def _work_beside(recorder: Recorder, queue: QueueReader) -> None:
     """Load what draws the file, which takes a second, before the run has ended; tell the size of the files."""
     from flowrec.physics import sample
 
-    still = FlowField(0, 0, "", 1.0, np.zeros((2, 2, 2)), np.zeros((2, 2)), None, [0.0], 1.0, 1.0, "")
+    velocity, pressure = np.zeros((2, 2, 2), np.float32), np.zeros((2, 2), np.float32)
+    still = FlowField(0, 0, "", 1.0, velocity, pressure, None, np.zeros(1), 1.0, 1.0, "")
     for places in ((0.0, 0.0), np.zeros((1, 2))):
         sample(still, places)  # by kernels, which are loaded now
 
