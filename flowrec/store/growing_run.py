@@ -49,7 +49,7 @@ def live_runs() -> list[LiveRun]:
         own = str(process.info["username"]).rpartition("\\")[2] == me
         if own and MODULE in words[:-1] and process.info["status"] != psutil.STATUS_ZOMBIE:
             path = Path(words[-1])
-            if not path.name.startswith("."):
+            if not path.name.startswith(".") and run_files(path):
                 found.append(LiveRun(path, process.pid, process.info["create_time"]))
     return sorted(found, key=lambda run: run.since_unix_s)
 

@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from flowrec.core import stopped_in_one_line
-from flowrec.store import existing_session
+from flowrec.store import session_path
 
 if TYPE_CHECKING:
     from flowrec.stages import Config
@@ -32,7 +32,7 @@ def readable_toml(file: Path | None) -> Path | None:
 
 AsConfig = Union[Path, str, "Config", None]
 SessionFile = Annotated[
-    AnySession, typer.Argument(metavar="SESSION", callback=existing_session, help="Session (.mcap), or its URL.")
+    AnySession, typer.Argument(metavar="SESSION", callback=session_path, help="Session (.mcap), or its URL.")
 ]
 
 _SET = typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb.")

@@ -106,6 +106,10 @@ def replay(
         raise MisuseError("--verify only compares; it goes without --refly")
     if jobs != 1 and (change != Change() or out is not None):
         raise MisuseError("--verify --jobs only compares: it goes without --refine, --set, --out ...")
+    if isinstance(session, Path | str):
+        from flowrec.store import existing_session
+
+        existing_session(session)  # before imports that take a second
     from flowrec.verbs.replay_made import Replay, make_replay
 
     if jobs != 1:
