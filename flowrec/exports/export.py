@@ -67,6 +67,7 @@ def export(
         before = "" if named else written_sha256(target, facts)
         output = Output(target, exporter.suffixes, inputs, overwrite, before)
     output.check()
+    made_from = _made_from(inputs)  # before they are read: who changes them meanwhile gets a new one
     began_s, length_s = time.perf_counter(), max(session.duration_s, 1e-3)
     with (
         progress(f"writing {target.name}", length_s, "s") as done,
@@ -77,7 +78,7 @@ def export(
         done(length_s)  # it reads to the end or raises, and tells less often how far
     if isinstance(output, Output):
         try:
-            note_written(target, facts | {_MADE_FROM: _made_from(inputs)})
+            note_written(target, facts | {_MADE_FROM: made_from})
         except OSError as error:  # the export itself is whole
             warn(f"{target}: its hash can not be kept ({error.strerror or error}): only --overwrite will replace it")
     took_s, amount = time.perf_counter() - began_s, Coverage(length_s, length_s, "s").amount

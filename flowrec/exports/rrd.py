@@ -30,8 +30,6 @@ from flowrec.view import (
 if TYPE_CHECKING:
     import rerun as rr
 
-    from flowrec.run import ReplayFiles
-
 
 # What the table of a replay tells of its commands and the panel leaves out: it has room for eleven rows.
 _OF_COMMANDS = ("commands_compared", "commands_difference_rms_um_s")
@@ -75,18 +73,17 @@ class RrdExport:
             summary = _pair(session, self._second)
         elif parent is not None:
             prefixes, sessions = REPLAY, [Session(parent), session]
-            from flowrec.run import ReplayFiles
-
-            summary = _comparison(ReplayFiles.of(*sessions))
+            summary = _comparison(*sessions)
         else:
             summary = document_of_run(session.path.stem, session.last, session.outcome)
         ticks = [each.ticks(with_frames=each is sessions[0]) for each in sessions]
         write_rrd(part, scene, dict(zip(prefixes, ticks, strict=True)), progress, summary)
 
 
-def _comparison(pair: ReplayFiles) -> rr.TextDocument:
-    from flowrec.run import before_after  # which imports all stages
+def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:
+    from flowrec.run import ReplayFiles, before_after  # late: they import all stages
 
+    pair = ReplayFiles.of(recorded, replayed)
     rows = before_after(pair)
     planners = next((values for key, *values in rows if key == "planner"), [None, None])
     hidden = {*_OF_COMMANDS, *(("planner",) if planners[0] == planners[1] else ())}

@@ -28,6 +28,7 @@ from flowrec.core import (
     Output,
     Progress,
     RigError,
+    Route,
     Tick,
     UsageError,
     kernels_cached,
@@ -262,14 +263,14 @@ def rehearse(config: Config, stopped: Callable[[], object] = lambda: False, prog
     worker = LockstepWorker(pipeline, _ADOPT_AFTER_S)
     with BoundedProcess("kernels", _HELP_S, error=FlowrecError) as helper:
         if not kernels_cached():  # two processors compile in two thirds of the time
-            helper.begin(_plan, resolved, chip)
+            helper.begin(route_on_assumed_flow, resolved, chip)
         run(pipeline, SimulatedRig.of(pipeline, resolved, LENGTH_S), worker, [], control=control, on_tick=on_tick)
 
 
-def _plan(config: ResolvedConfig, chip: Chip) -> None:
-    """Plan the way of the rehearsal, in another process, which leaves the kernels of planning in the cache."""
+def route_on_assumed_flow(config: ResolvedConfig, chip: Chip) -> Route:
+    """The way of a mission from its start to its goal on the flow that the chip states."""
     start_um, goal_um = np.array(config.mission.start, np.float64), np.array(config.mission.goal, np.float64)
-    config.plan.plan(config.flow.solve(chip), start_um, goal_um, chip, config.robot)
+    return config.plan.plan(config.flow.solve(chip), start_um, goal_um, chip, config.robot)
 
 
 def rehearse_aloud(config: Config, control: Unattended) -> None:

@@ -39,7 +39,7 @@ from flowrec.stages import (
     resolve,
 )
 from flowrec.store import frames_of, image_bytes_s
-from flowrec.verbs.admission import rehearse
+from flowrec.verbs.admission import rehearse, route_on_assumed_flow
 from flowrec.verbs.preparation import refuse_adrift
 from flowrec.view import executable, has_display
 
@@ -165,9 +165,7 @@ def _mission(config: ResolvedConfig, chip: Chip) -> Findings:
         yield Finding("mission", OK, "observes: the coils are not used")
         return
     refuse_adrift(config, chip)
-    field = config.flow.solve(chip)
-    start, goal = np.array(mission.start), np.array(mission.goal)
-    route = config.plan.plan(field, start, goal, chip, config.robot)
+    route = route_on_assumed_flow(config, chip)
     if not route.reachable:
         yield Finding("mission", FAILURE, f"no route on the assumed flow: {route.reason}; choose another goal")
         return

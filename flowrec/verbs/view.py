@@ -89,11 +89,13 @@ def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: 
     if session.suffix == ".rrd":
         return session, []
     from flowrec.exports import kept_rrd
+    from flowrec.store import Session
 
-    kept = None if overwrite else kept_rrd(session, out, beside)
+    opened, second = Session.of(session), None if beside is None else Session.of(beside)
+    kept = None if overwrite else kept_rrd(opened, out, second)
     if kept is not None:
         return kept, [f"{kept} is as it was made of this session"]
-    return export(session, out, overwrite, beside=beside), []
+    return export(opened, out, overwrite, beside=second), []
 
 
 def _watch(session: Path | None, no_open: bool, outputs: Iterable[object]) -> Told:

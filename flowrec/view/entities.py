@@ -142,10 +142,9 @@ class EntityLogger:
         """Log a value of each line of a plot."""
         self.row(entity, rr.Scalars, scalars=values)
 
-    def encoded_row(self, entity: str, kind: Any, field: str, encode: Callable[..., bytes], *given: Any) -> None:
-        """Log a field whose one component takes time to encode."""
-        done = encode(*given) if self._columns is None else self._columns.encode(encode, *given)
-        self.row(entity, kind, **{field: [done]})
+    def encode(self, function: Callable[..., bytes], *given: Any) -> Any:
+        """A component of a row that takes time to encode: what the function returns, or will have returned."""
+        return function(*given) if self._columns is None else self._columns.encode(function, *given)
 
     def _note(self, entity: str) -> None:
         if entity in OPTIONAL or entity.startswith(EXTRA):

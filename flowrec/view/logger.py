@@ -174,7 +174,8 @@ class TickLogger:
             drawn = rr.EncodedImage.from_fields(media_type="image/jpeg", draw_order=-20.0)
             self._log(e.IMAGE, placed, drawn, static=True)
         image = self._windows.complete(frame.image) if self._scene.windows else frame.image
-        self._entities.encoded_row(e.IMAGE, rr.EncodedImage, "blob", encode_jpeg, image, frame.bits, _JPEG_QUALITY)
+        jpeg = self._entities.encode(encode_jpeg, image, frame.bits, _JPEG_QUALITY)
+        self._row(e.IMAGE, rr.EncodedImage, blob=[jpeg])
 
     def _log_route(self, route: Route) -> None:
         self._flow.log_time_to_go(route)

@@ -33,23 +33,6 @@ def pictures(bits=8, count=COUNT):
     return [np.clip(slope + rng.normal(0, top / 20, slope.shape), 0, top).astype(dtype) for _ in range(count)]
 
 
-def test_the_early_end_of_a_movie_is_what_its_rig_noticed_while_it_played(tmp_path):
-    folder = makers.folder(tmp_path / "pngs", pictures())
-    broken = folder / "img_5.png"
-    broken.write_bytes(broken.read_bytes()[:60])
-    source = MovieSource(MovieSettings(path=str(folder), rate_hz=10.0, partial=True), Coils())
-    source._log_remarks.append("what the log said when it was read")
-    with MovieRig(source, 0.0) as rig:
-        assert len(list(rig.inputs())) == 5
-        assert len(rig.noticed) == 1 and rig.noticed[0].startswith("only the first 5 images were taken: ")
-
-
-def test_samples_of_more_bits_than_an_image_can_have_are_refused(tmp_path):
-    path = makers.folder(tmp_path / "pngs", pictures())
-    with open_movie(path) as movie, pytest.raises(MovieError, match=r"have 32 bits.*convert it, for example with ffm"):
-        movie._depth(32, 32)
-
-
 def read(path, **options):
     with open_movie(path, options=ReadOptions(**options)) as movie:
         frames = list(movie.frames())
@@ -300,6 +283,23 @@ def test_what_a_header_declares_is_not_believed(tmp_path):
     with pytest.raises(MovieError, match=r"image 5 holds nothing but 0: .* --partial takes the 5"):
         read(tmp_path / "part.zarr")
     assert len(read(tmp_path / "part.zarr", partial=True)[1]) == 5
+
+
+def test_the_early_end_of_a_movie_is_what_its_rig_noticed_while_it_played(tmp_path):
+    folder = makers.folder(tmp_path / "pngs", pictures())
+    broken = folder / "img_5.png"
+    broken.write_bytes(broken.read_bytes()[:60])
+    source = MovieSource(MovieSettings(path=str(folder), rate_hz=10.0, partial=True), Coils())
+    source._log_remarks.append("what the log said when it was read")
+    with MovieRig(source, 0.0) as rig:
+        assert len(list(rig.inputs())) == 5
+        assert len(rig.noticed) == 1 and rig.noticed[0].startswith("only the first 5 images were taken: ")
+
+
+def test_samples_of_more_bits_than_an_image_can_have_are_refused(tmp_path):
+    path = makers.folder(tmp_path / "pngs", pictures())
+    with open_movie(path) as movie, pytest.raises(MovieError, match=r"have 32 bits.*convert it, for example with ffm"):
+        movie._depth(32, 32)
 
 
 HOUR = {"s": 3600, "ms": 3.6e6, "\u00b5s": 3.6e9, "\u03bcs": 3.6e9, "us": 3.6e9, "ns": 3.6e12, "min": 60, "h": 1}

@@ -115,5 +115,9 @@ def test_runs_are_listed_while_they_are_recorded_and_only_those_can_be_watched(t
         (run,) = [run for run in live_runs() if run.path.parent == tmp_path]
         assert run.process == writer._recorder._child.process.pid
     assert path not in [run.path for run in live_runs()]
+    lost = SessionWriter(tmp_path / "lost.mcap", HEADER, OPTIONS)
+    lost.partial_path.unlink()  # as when its folder is removed: there is nothing to be watched
+    assert lost.path not in [run.path for run in live_runs()]
+    lost.discard()
     with pytest.raises(SessionError, match="is not being recorded; `flowrec ls --live`"):
         GrowingRun(path)

@@ -159,6 +159,9 @@ def cells(path: Path) -> set[tuple[str, ...]]:
 
 
 def test_a_file_holds_what_a_live_viewer_is_sent_row_by_row(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
+    ticks = [
+        replace(tick, truth=tick.truth if number % 3 else None) for number, tick in enumerate(ticks)
+    ]  # fewer lines
     write_rrd(tmp_path / "file.rrd", scene, {"": ticks})
     with open_stream(scene) as stream:
         stream.save(tmp_path / "live.rrd")

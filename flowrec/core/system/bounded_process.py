@@ -55,7 +55,7 @@ class BoundedProcess:
         try:
             if sys.platform == "win32":
                 timer.start()
-            child.send((self._cpu_s, self._memory_bytes, function, given))
+            self.begin(function, *given)
             answer, failure = child.receive()
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             raise self._error(f"{self._where}: {self._cause(child)}") from error
