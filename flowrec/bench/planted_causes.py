@@ -85,7 +85,7 @@ def _of_the_chip(config: ResolvedConfig, chip: Chip) -> Iterator[str]:
     if depth_um is not None and (chip.depth_um is None or abs(depth_um / chip.depth_um - 1.0) > _DEPTH):
         yield "chip depth"
     if simulated.value("wall_error_px") > _WALLS_PX:
-        yield "the walls seem off|the mask seems wrong"
+        yield "the walls seem off|the mask (seems|may be) "
     if simulated.value("blocked_share") > 0.0:
         yield "a channel is partly blocked"
 

@@ -47,4 +47,5 @@ from .flow.sensitivities import Remainder as Remainder, Sensitivities as Sensiti
 from .flow.solver import FlowSolver as FlowSolver
 from .flow.uncertainty import Doubts as Doubts, FlowUncertainty as FlowUncertainty, Registration as Registration
 from .flow.velocity_stencil import pixel_weights as pixel_weights, velocity_at as velocity_at
+from .flow.wall_offset import with_wall_offset as with_wall_offset
 from .robot import Robot as Robot, RobotSettings as RobotSettings, USUAL_DELAY_S as USUAL_DELAY_S

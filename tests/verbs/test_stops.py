@@ -105,6 +105,7 @@ def test_of_a_stopped_verification_in_segments_those_count_that_were_done(monkey
                 task.set_exception(BrokenProcessPool())
 
     monkeypatch.setattr(replay_segments, "pool", pool)
+    monkeypatch.setattr(replay_segments, "NUMERICS_VERSION", 3)  # those of the session: it can be entered anywhere
     monkeypatch.setattr(replay_segments, "_TICKS", 40)
     done = replay_segments.verify(MODERATE, jobs=2, control=attended)
     assert len(tasks) > 2 and (done.same, done.exit_status) == (None, 143)

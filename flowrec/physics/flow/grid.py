@@ -119,7 +119,9 @@ def build(chip: Chip, k: int, walls: LevelSet | None = None) -> Grid:
     FlowError
         If the pixels of an opening are not one run of fluid.
     """
-    walls = from_mask(chip.mask, k, chip.walls) if walls is None else walls
+    if walls is None:
+        drawn = chip.mask if chip.drawn is None else chip.drawn
+        walls = from_mask(drawn, k, chip.walls, chip.wall_offset_px)
     level = walls.level
     split = _split_cells(level)
     # Upright faces; the level ones are those with rows and columns exchanged.

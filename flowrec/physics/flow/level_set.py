@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
 from flowrec.core import Bools, Floats, Ints
@@ -57,9 +58,12 @@ def from_distance(distance: Callable[[Floats, Floats], Floats], shape: tuple[int
     return LevelSet(np.asarray(distance(x, y), np.float64), staircase=False)
 
 
-def from_mask(mask: Bools, k: int, walls: Walls) -> LevelSet:
-    """Walls of a mask (h, w): `pixel` follows the edges of its pixels, `smooth` the smoothest contour it allows."""
-    return _staircase(mask, k) if walls == "pixel" else _smooth(mask, k)
+def from_mask(mask: Bools, k: int, walls: Walls, offset_px: float = 0.0) -> LevelSet:
+    """Walls of a mask (h, w): `pixel` follows the edges of its pixels, `smooth` the smoothest contour it allows.
+
+    Walls can be moved outwards by an offset, those of pixels by multiples of half a subcell.
+    """
+    return _staircase(mask, k, offset_px) if walls == "pixel" else _smooth(mask, k, offset_px)
 
 
 def subcells(pixels: NDArray[Any], k: int) -> NDArray[Any]:
@@ -67,9 +71,11 @@ def subcells(pixels: NDArray[Any], k: int) -> NDArray[Any]:
     return np.repeat(np.repeat(pixels, k, axis=0), k, axis=1)
 
 
-def _staircase(mask: Bools, k: int) -> LevelSet:
-    """The edges of the pixels."""
-    fluid = subcells(mask, 2 * k)
+def _staircase(mask: Bools, k: int, offset_px: float) -> LevelSet:
+    """The edges of the pixels, moved outwards: first by whole pixels, then by half subcells."""
+    whole = int(offset_px)
+    fluid = subcells(_move_edges(mask, whole), 2 * k)
+    fluid = _move_edges(fluid, round((offset_px - whole) * 2 * k))
     # A sample lies between four quarters of subcells: in fluid where all are fluid, on the wall where only some are.
     around = np.pad(fluid, 1, mode="edge")
     corners = [around[:-1, :-1], around[:-1, 1:], around[1:, :-1], around[1:, 1:]]
@@ -77,12 +83,21 @@ def _staircase(mask: Bools, k: int) -> LevelSet:
     return LevelSet(level, staircase=True)
 
 
-def _smooth(mask: Bools, k: int) -> LevelSet:
-    """Signed distance to the smoothed contour of the mask, computed in half subcells."""
+def _move_edges(mask: Bools, steps: int) -> Bools:
+    """A mask whose edges are moved outwards by steps along the axes; beyond the border of the image it goes on."""
+    if steps == 0:
+        return mask
+    if steps > 0:
+        return np.asarray(scipy.ndimage.binary_dilation(mask, iterations=steps))
+    return np.asarray(scipy.ndimage.binary_erosion(mask, iterations=-steps, border_value=1))
+
+
+def _smooth(mask: Bools, k: int, offset_px: float) -> LevelSet:
+    """Signed distance to the smoothed contour of the mask, moved outwards, computed in half subcells."""
     unit = 2 * k
     shape = (mask.shape[0] * unit + 1, mask.shape[1] * unit + 1)
     begin, end = ((points + 0.5) * unit for points in contour_segments(mask, SEGMENTS_PER_GATE))
-    reach = max(LEAST_REACH, REACH_PX * unit)
+    reach = max(LEAST_REACH, REACH_PX * unit) + abs(offset_px) * unit
     width = int(np.ceil(np.abs(end - begin).max(initial=0.0) + 2.0 * reach)) + 1
     window = np.stack(np.meshgrid(np.arange(width), np.arange(width)), axis=-1).reshape(-1, 2)
     chunk = CHUNK // len(window) + 1
@@ -104,7 +119,7 @@ def _smooth(mask: Bools, k: int) -> LevelSet:
         flat = level.ravel()
         flat[sample] = np.copysign(nearest[sample], np.where(sign[sample] == 0.0, flat[sample], sign[sample]))
     _keep_topology(level, mask, k)
-    return LevelSet(level / unit, staircase=False)
+    return LevelSet(level / unit + offset_px, staircase=False)
 
 
 def _distances(a: Floats, b: Floats, window: Ints, shape: tuple[int, int], reach: float) -> tuple[Ints, Floats, Floats]:

@@ -10,19 +10,21 @@ observations contradict the walls. The field is the mean over these hypotheses, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import Floats, FlowError, FlowField, Range
+from flowrec.core import Bools, Floats, FlowError, FlowField, Range
 from flowrec.physics import Chip, FlowSolver, fluid_image, law_text, median_width_um
 from flowrec.stages.refine.causes import AS_STATED, Observed
 from flowrec.stages.refine.discretisation_error import ModelError
 from flowrec.stages.refine.disturbances import held_back
 from flowrec.stages.refine.field_variance import expected_error, field_variance, prior_variance
-from flowrec.stages.refine.findings import findings, with_mask_faults
+from flowrec.stages.refine.findings import findings, with_obstacle
 from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.held_back import scores_of
 from flowrec.stages.refine.hypothesis import (
@@ -32,24 +34,23 @@ from flowrec.stages.refine.hypothesis import (
     Steps,
     begin,
     complete,
-    doubtful,
     first_evidence,
     of_the_field,
     outlying,
     robust_noise,
     shaking_stage,
 )
-from flowrec.stages.refine.mask_variants import mask_variants
 from flowrec.stages.refine.method import RefinementProblem
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.obstacles import PLACES, Obstacle, likely_obstacles, with_shape_error
 from flowrec.stages.refine.prior import PriorSettings
 from flowrec.stages.refine.report import over_error, report
+from flowrec.stages.refine.wall_bias import in_biased_walls
 
-LEAST_GAIN = 4.0  # in ln evidence, before other walls than the chip's are taken
 LARGEST_PX = 30_000  # fluid pixels of a chip for which depths and walls are tried: each is a geometry of its own
 DEPTHS_WIDTHS = (0.4, 0.8, 1.6, 3.2)  # grid of depths of a chip that states none, in median channel widths
 DEPTH_STD_SHARE = 0.3  # standard deviation around each of them: half of their spacing in ln depth
+BIASED_SHARE = 0.3  # odds that all walls are off by the same distance, before any observation
 UNSTATED_SHARE = 0.8  # prior probability that the depth of such a chip does not matter
 # Power of the likelihood ratio of chips, of other depths and with obstacles (a coarsened posterior, Miller and Dunson
 # 2019): what no hypothesis explains (uneven rolling, optics, walls, contacts) favours one of them by chance. Where the
@@ -71,7 +72,7 @@ BEHIND = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """The flows of the plausible hypotheses on the same fluid pixels, and their probabilities.
+    """The flows of the plausible hypotheses, on the fluid pixels of the chip's mask, and their probabilities.
 
     The chip as it is stated stands until another depth is likelier after the observations than before: the mean gives
     others the weight by which their evidence exceeds that of the stated one. The variance around it counts all by their
@@ -81,7 +82,7 @@ class Hypotheses:
     found: list[HypothesisFit]
     weights: Floats  # probabilities
     shares: Floats  # of the mean
-    wrong_mask: str  # how the chip's mask is wrong, in words; '' where it is not
+    mask: Bools  # (h, w) of the chip
     obstacles: tuple[Obstacle, ...] = ()  # of the last hypotheses, one each
 
     @property
@@ -98,9 +99,14 @@ class Hypotheses:
         return self.found[int(np.argmax(self.shares))]
 
     @property
+    def flows(self) -> Floats:
+        """(hypotheses, n, 2) the flow of each."""
+        return np.stack([one.on_pixels_of(self.mask, one.flow) for one in self.found])
+
+    @property
     def flow(self) -> Floats:
         """(n, 2) the mean."""
-        return np.asarray(np.tensordot(self.shares, np.stack([one.flow for one in self.found]), axes=1))
+        return np.asarray(np.tensordot(self.shares, self.flows, axes=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +114,7 @@ class Assimilate(PriorSettings):
     """Settings of the assimilation. Prior widths are one standard deviation."""
 
     model: ModelError = field(default_factory=ModelError)
-    doubt_walls: bool = True  # try walls a pixel off where the observations contradict the chip's
+    doubt_walls: bool = True  # all walls may lie the same distance off
     doubt_depth: bool = True  # try depths where the chip states none
     max_steps: Annotated[int, Range(1, 1_000)] = 8  # of the full equations with frozen factors
     tolerance: Annotated[float, Range(1e-12, 1.0)] = 2e-3  # last such step over the fastest speed
@@ -139,13 +145,7 @@ class Assimilate(PriorSettings):
         problem = replace(problem, operator=operator)
         every = self.hypotheses(problem.operator, problem.chip, problem.solver)
         if obstacles and problem.chip.law is None and np.count_nonzero(problem.chip.mask) <= LARGEST_PX:
-            drawn = every
-            if every.wrong_mask:
-                drawn = replace(self, doubt_walls=False).hypotheses(problem.operator, problem.chip, problem.solver)
-            blocked = self._with_obstacles(drawn, problem)
-            # Walls that are wrong everywhere and a single obstacle can look alike.
-            if not every.wrong_mask or blocked.best.posterior.evidence > every.best.posterior.evidence:
-                every = blocked
+            every = self._with_obstacles(every, problem)
         flow_um_s, std_um_s = of_the_field(every.best)
         return self._field(every, problem), replace(problem.operator, flow_um_s=flow_um_s, std_um_s=std_um_s)
 
@@ -197,33 +197,36 @@ class Assimilate(PriorSettings):
         cases = [(chip, AS_STATED, prior[0] * AS_STATED_SHARE)]
         prior[0] *= 1.0 - AS_STATED_SHARE
         cases += [(other, 1.0, share) for other, share in zip(chips, prior, strict=True)]
-        begun = []
+        begun: list[tuple[Robust, State, float]] = []
         for other, usual, share in cases:
             with suppress(FlowError):  # a depth whose flow can not be computed
                 observed = own if other is chip else self._observe(other, chip, operator, solver)
-                begun.append((begin(replace(observed, usual=usual), robust, steps), np.log(share)))
-        ln_weight = np.array([CHIP_POWER * state.sizes.evidence + ln_prior for state, ln_prior in begun])
-        best = begun[int(np.argmax(ln_weight))]
-        if self.doubt_walls and small and doubtful(best[0].evidence, best[0].sizes):
-            wrong, moved = self._better_mask(operator, best[0].observed.model.chip, chip, solver, robust, best[0])
-            if moved is not None:
-                return Hypotheses([moved], np.ones(1), np.ones(1), wrong)
-        least = ln_weight.max() + np.log(LEAST_WEIGHT)
-        found = [
-            (complete(robust, state, steps), ln_prior)
-            for (state, ln_prior), ln in zip(begun, ln_weight, strict=True)
-            if ln > least
-        ]
-        evidence = np.array([one.posterior.evidence for one, _ in found])
-        ln_weight = CHIP_POWER * evidence + np.array([ln_prior for _, ln_prior in found])
+                begun.append((robust, begin(replace(observed, usual=usual), robust, steps), float(np.log(share))))
+        if self.doubt_walls and small:
+            noise, state, ln_share = begun[1]  # walls that are off by chance only
+            observe = partial(self._observe, stated=chip, operator=operator)
+            found_so = in_biased_walls(chip, solver, state, noise, observe, steps)
+            begun += [(*one, ln_share + float(np.log(BIASED_SHARE))) for one in found_so]
+
+        def ln_weights(evidence: list[float], which: Sequence[int]) -> tuple[Floats, Floats]:
+            """Ln of the posterior probabilities, and of the likelihood ratios to the chip as it is drawn."""
+            drawn = [begun[index][1].observed for index in which]
+            stated = np.array([one.wall_mode is None and one.model.chip.depth_um == chip.depth_um for one in drawn])
+            gains = np.array(evidence) - max(np.array(evidence)[stated] if stated.any() else evidence)
+            power = np.array([CHIP_POWER if one.wall_mode is None else 1.0 for one in drawn])
+            ln_prior = np.array([begun[index][2] for index in which])
+            return power * gains + ln_prior, np.where(stated | ~stated.any(), np.inf, power * gains)
+
+        # What was an outlier in one hypothesis may be explained by another.
+        every = range(len(begun))
+        first, _ = ln_weights([state.sizes.evidence - outlying(noise) for noise, state, _ in begun], every)
+        plausible = [index for index in every if first[index] > first.max() + np.log(LEAST_WEIGHT)]
+        found = [complete(*begun[index][:2], steps) for index in plausible]
+        ln_weight, ln_ratio = ln_weights([one.posterior.evidence - outlying(one.robust) for one in found], plausible)
         weights = np.exp(ln_weight - ln_weight.max())
-        shares = weights.copy()
-        stated = np.array([one.observed.model.chip.depth_um == chip.depth_um for one, _ in found])
-        if stated.any():
-            # weight - prior x evidence of the stated depth: of what is not likelier than that, nothing is left.
-            gains = evidence[~stated] - evidence[stated].max()
-            shares[~stated] *= -np.expm1(np.minimum(-CHIP_POWER * gains, 0.0))
-        return Hypotheses([one for one, _ in found], weights / weights.sum(), shares / shares.sum(), "")
+        # weight - prior x evidence of the stated chip: of what is not likelier than that, nothing is left.
+        shares = weights * -np.expm1(np.minimum(-ln_ratio, 0.0))
+        return Hypotheses(found, weights / weights.sum(), shares / shares.sum(), chip.mask)
 
     def _plausible(
         self, chips: list[Chip], prior: list[float], operator: ObservationOperator, solver: FlowSolver, robust: Robust
@@ -276,7 +279,7 @@ class Assimilate(PriorSettings):
             every.found + found,
             weights / weights.sum(),
             shares / shares.sum(),
-            "",
+            every.mask,
             tuple(obstacle for obstacle, *_ in tried),
         )
 
@@ -301,71 +304,30 @@ class Assimilate(PriorSettings):
         settings = replace(self, depth_std_share=DEPTH_STD_SHARE) if chip.depth_um != stated.depth_um else self
         return Observed.of(flow_model(settings, self.model, chip, solver), operator)
 
-    def _better_mask(
-        self,
-        operator: ObservationOperator,
-        chip: Chip,
-        stated: Chip,
-        solver: FlowSolver,
-        robust: Robust,
-        own: State,
-    ) -> tuple[str, HypothesisFit | None]:
-        """Error of the mask in words, and the flow in a mask of far higher evidence; '' and None where there is none.
-
-        `own` is the state of the chip, whose depth stays; `stated` is the chip as it is assumed.
-        """
-        steps = Steps(self.max_steps, self.tolerance)
-        coarse = replace(solver, k=1)
-        before = own if solver.k == 1 else begin(self._observe(chip, stated, operator, coarse), robust, steps)
-        gains = []
-        for words, other in mask_variants(chip):
-            with suppress(FlowError):  # a variant that carries no flow is left out
-                state = begin(self._observe(other, stated, operator, coarse), robust, steps)
-                gains.append((state.sizes.evidence - before.sizes.evidence, words, other))
-        gain, words, other = max(gains, key=lambda entry: entry[0], default=(0.0, "", chip))
-        if gain <= LEAST_GAIN:
-            return "", None
-        # The coarse grid proposes, the fine one decides.
-        observed = self._observe(other, stated, operator, solver)
-        state = begin(observed, robust, steps)
-        if state.sizes.evidence <= own.sizes.evidence + LEAST_GAIN:
-            return "", None
-        return words, complete(robust, state, steps)
-
     def _field(self, every: Hypotheses, problem: RefinementProblem) -> FlowField:
         """The mean over the hypotheses as a field on the chip's own mask."""
         chip, best = problem.chip, every.best
-        mask = best.observed.model.chip.mask
         mean = every.flow
-        variance = sum(
-            (
-                weight * (field_variance(one) + (one.flow - mean) ** 2)
-                for one, weight in zip(every.found, every.weights, strict=True)
-            ),
-            np.zeros_like(mean),
-        )
+        variance = np.zeros_like(mean)
+        for one, flow, weight in zip(every.found, every.flows, every.weights, strict=True):
+            variance += weight * (one.on_pixels_of(chip.mask, field_variance(one)) + (flow - mean) ** 2)
         model = best.observed.model
         z = best.posterior.mean
         fitted = model.prior.chip(model.chip, z)
         pressure = model.expansion.pressure(model.prior.offset(z), best.remainder)
-        pressure = pressure * fitted.viscosity_mpa_s / chip.viscosity_mpa_s
+        pressure = best.on_pixels_of(chip.mask, pressure) * (fitted.viscosity_mpa_s / chip.viscosity_mpa_s)
         velocity_um_s, std_um_s, pressure_pa = (
-            np.where(
-                chip.mask.reshape(chip.mask.shape + (1,) * (values.ndim - 1)),
-                fluid_image(mask, values.astype(np.float32)),
-                np.float32(0.0),
-            )
-            for values in (mean, np.sqrt(variance), pressure)
+            fluid_image(chip.mask, values.astype(np.float32)) for values in (mean, np.sqrt(variance), pressure)
         )
         # The mean speed is that through the opening as the chip has it, at the same flow rate.
         widths = [
             (other.width_px / opening.width_px if opening.kind == "inlet" else 1.0)
             for other, opening in zip(model.chip.openings, chip.openings, strict=True)
         ]
-        also = with_mask_faults(findings(every.found, every.weights), chip, every.wrong_mask, every.obstacle)
+        also = with_obstacle(findings(every.found, every.weights), chip, every.obstacle)
         moved = over_error((velocity_um_s - problem.assumed.velocity_um_s)[chip.mask], std_um_s[chip.mask])
         note = report(chip, problem.operator, best, also.words, moved)
-        scores = scores_of(best, problem.before) if problem.hold_back else None
+        scores = scores_of(best, problem.assumed, problem.before) if problem.hold_back else None
         field = replace(
             problem.assumed,
             method="assimilate",

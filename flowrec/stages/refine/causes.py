@@ -45,6 +45,9 @@ RESISTANCE = (0.05, 1.0)  # of a cell: a channel 3 % narrower than drawn has 9 %
 WALLS = (0.29, 0.8)  # px by which a wall is off: a wall somewhere in its pixel, 1 / sqrt(12)
 WALLS_LONG = np.sqrt(0.5)  # of it, what extends over a cell: half of the variance; the rest over a channel's width
 LOCAL = (1.0, 0.8)  # of the error of the grid that the model states
+# px by which all walls are off, where they are: a quarter of a pixel to one, by the threshold of a segmentation
+WALL_BIAS = (0.5, 0.6)
+WALL_BIAS_NAME = "wall bias"
 GAIN = (0.08, 1.3)  # um per revolution is known to a few per cent where it was calibrated, else to 15 %
 HEADING = (0.01, 0.8)  # rad: coils and camera are aligned to half a degree
 CURVED = (0.12, 0.8)  # of the part of Faxen's law that a sphere as large as the least distance to a wall would show
@@ -95,6 +98,7 @@ class Observed:
     stated: ObservationOperator  # where the registration puts the observations
     moved: Floats  # (n, 2) px from there to where the flow is read, by the registration in use
     usual: float = 1.0  # sizes of the effects in _STATED, over what is usual
+    wall_mode: Floats | None = None  # (n, 2) see wall_bias.py; None: the walls have no bias
 
     @classmethod
     def of(cls, model: FlowModel, operator: ObservationOperator, moved: Floats | None = None) -> Observed:
@@ -126,7 +130,7 @@ class Observed:
         """The observations moved by a registration (4,): offset x and y in px, scale, angle in rad."""
         away = self.away
         moved = np.asarray(registration[:2] - registration[2] * away - registration[3] * _quarter_turn(away))
-        return replace(Observed.of(self.model, self.stated, moved), usual=self.usual)
+        return replace(Observed.of(self.model, self.stated, moved), usual=self.usual, wall_mode=self.wall_mode)
 
     @property
     def away(self) -> Floats:
@@ -162,9 +166,10 @@ class Observed:
     def effects(self, flow: Floats, line_hz: float | None) -> list[Effect]:
         """All effects around a flow (n, 2) of the model's pixels, with columns for the observations, x and y of each.
 
-        The first four have unknowns that belong to the field: boundary values, fluid, resistances, walls.
+        The first have unknowns that belong to the field: boundary values, fluid, resistances, walls and their bias.
         """
         here, model = self.operator, self.model
+        modes = [] if self.wall_mode is None else [self.wall_mode]
         v = here.predict(flow)
         gradient = self._gradient(flow)
         rolled, time_s = here.rolled_um_s, here.time_s
@@ -179,6 +184,7 @@ class Observed:
             _effect("fluid", FLUID, known[openings:]),
             _effect("resistance", RESISTANCE, here.predict(model.resistance)),
             replace(_effect("walls", WALLS, self._widening_flow(v)), kernel=self._beside_walls(v, gradient)),
+            *(_effect(WALL_BIAS_NAME, WALL_BIAS, here.predict(mode[None])) for mode in modes),
             _effect("offset", OFFSET_PX, gradient),
             _effect("scale", SCALE, stretch[None]),
             _effect("angle", ANGLE, turn[None]),

@@ -13,7 +13,8 @@ from flowrec.stages.refine.hypothesis import HypothesisFit
 
 def field_columns(found: HypothesisFit) -> Floats:
     """(p, n, 2) um/s per unit of each of the first p unknowns, which are those of the flow."""
-    return _columns(found.observed.model, found.in_use)
+    columns, bias = _columns(found.observed.model, found.in_use), found.observed.wall_mode
+    return columns if bias is None else np.concatenate([columns, bias[None]])
 
 
 def field_variance(found: HypothesisFit) -> Floats:

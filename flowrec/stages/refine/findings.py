@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from flowrec.core import Floats, FlowField
 from flowrec.physics import Chip
-from flowrec.stages.refine.causes import LINE_NAME, WANDER_S
+from flowrec.stages.refine.causes import LINE_NAME, WALL_BIAS_NAME, WANDER_S
 from flowrec.stages.refine.disturbances import SHAKE
 from flowrec.stages.refine.hypothesis import HypothesisFit
 from flowrec.stages.refine.obstacles import Obstacle
@@ -119,8 +119,25 @@ def findings(found: Sequence[HypothesisFit], weights: Floats) -> Findings:
             )
     time_s = found[0].observed.operator.time_s
     observed_s = 0.0 if time_s is None else float(np.ptp(time_s))
-    words = (*_words(values, stds, found[0].observed.um_per_px, observed_s), *depth_words)
+    words = (*_bias_words(found, weights), *_words(values, stds, found[0].observed.um_per_px, observed_s), *depth_words)
     return Findings(tuple(names), np.array([values[n] for n in names]), np.array([stds[n] for n in names]), words)
+
+
+def _bias_words(found: Sequence[HypothesisFit], weights: Floats) -> list[str]:
+    """That all walls are off by the same distance, where that is likely."""
+    biased = [index for index, one in enumerate(found) if one.observed.wall_mode is not None]
+    share = float(weights[biased].sum())
+    if share < 0.5:
+        return []
+    mean, covariance = found[biased[0]].unknowns(WALL_BIAS_NAME)
+    px = found[biased[0]].observed.um_per_px
+    outside_um, std_um = px * float(mean[0]), px * float(np.sqrt(covariance[0, 0]))
+    if abs(outside_um) < MOVED_PX * px:
+        return []
+    seems = "seems" if share > PROBABLE else f"may be ({share:.0%})"
+    way = "narrow" if outside_um > 0.0 else "wide"
+    size = with_error(abs(outside_um), std_um)
+    return [f"the mask {seems} wrong: its channels are drawn {size} um too {way} on each side"]
 
 
 def _values(one: HypothesisFit) -> dict[str, tuple[float, float]]:
@@ -191,18 +208,17 @@ def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: fl
     return words
 
 
-def with_mask_faults(found: Findings, chip: Chip, wrong_mask: str, obstacle: tuple[Obstacle, float] | None) -> Findings:
-    """Add the error of the mask in words, and the place of an obstacle whose probability exceeds PROBABLE."""
-    wrong = (f"the mask seems wrong: {wrong_mask}",) if wrong_mask else ()
+def with_obstacle(found: Findings, chip: Chip, obstacle: tuple[Obstacle, float] | None) -> Findings:
+    """Add the place of an obstacle whose probability exceeds PROBABLE."""
     if obstacle is None or obstacle[1] <= PROBABLE:
-        return replace(found, words=(*wrong, *found.words))
+        return found
     place = obstacle[0]
     x_um, y_um = place.column * chip.um_per_px, place.row * chip.um_per_px
     return Findings(
         (*found.names, "obstacle_x_um", "obstacle_y_um"),
         np.append(found.values, [x_um, y_um]),
         np.append(found.stds, 2 * [place.half_width_px * chip.um_per_px]),
-        (*wrong, f"a channel is partly blocked at ({x_um:.0f}, {y_um:.0f}) um", *found.words),
+        (f"a channel is partly blocked at ({x_um:.0f}, {y_um:.0f}) um", *found.words),
     )
 
 

@@ -80,7 +80,7 @@ def block_scores(covariance: Floats, y: Floats, held: list[Indices]) -> Floats:
     return np.array(scores)
 
 
-def scores_of(best: HypothesisFit, before: FlowField | None) -> Scores | None:
+def scores_of(best: HypothesisFit, assumed: FlowField, before: FlowField | None) -> Scores | None:
     """Scores of the likeliest hypothesis, and of the flow before it; None for too few observations.
 
     `before` is the refined flow in use; None: it is the assumed one.
@@ -92,10 +92,8 @@ def scores_of(best: HypothesisFit, before: FlowField | None) -> Scores | None:
     held = blocks(which)
     if not held:
         return None
-    null = best.in_assumed_flow()
-    if before is not None:
-        left = operator.flow_um_s - predicted_in(operator, before)
-        null = replace(null, y=averages(best.robust, operator) @ left.ravel())
+    left = operator.flow_um_s - predicted_in(operator, assumed if before is None else before)
+    null = replace(best.in_assumed_flow(), y=averages(best.robust, operator) @ left.ravel())
     ln_size = {effect.name: mode for effect, mode in zip(best.effects, best.sizes.mode, strict=True)}
     covariance = null.covariance(np.array([ln_size[effect.name] for effect in null.effects]))
     rows = pairs(which)

@@ -7,9 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats
-from flowrec.physics import Registration, Remainder
-from flowrec.stages.refine.causes import CURVED, RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
+from flowrec.core import Bools, Floats
+from flowrec.physics import Registration, Remainder, fluid_image
+from flowrec.stages.refine.causes import (
+    CURVED,
+    RESISTANCE,
+    WALL_BIAS_NAME,
+    WALLS,
+    WALLS_LONG,
+    Observed,
+    lines_hz,
+)
 from flowrec.stages.refine.disturbances import likeliest_hz, shaking
 from flowrec.stages.refine.evidence import Effect, EffectModel, Posterior, Sizes, gains_of_trials
 from flowrec.stages.refine.mixture_regression import Model
@@ -31,6 +39,7 @@ DOUBTED = (
     ("curved", CURVED[0], 3.0),
     ("noise", 1.0, 1.2),
 )
+GROWTH = 2.0  # of a step over the last one from which on the iteration for the nonlinear remainder diverges
 FAR_PX = 0.5  # by which an observation is moved at least: over less, the flow is linear
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
 NOISIER = 1.3  # noise over the stated one from which on a shaking stage is tried
@@ -41,6 +50,7 @@ FIELD_EFFECTS = (
     "fluid",
     "resistance",
     "walls",
+    WALL_BIAS_NAME,
 )  # the first ones, in the order of the columns of the flow
 
 
@@ -77,6 +87,11 @@ class HypothesisFit:
         base = self.observed.model.base
         full = _evidence(self.observed, self.robust, np.zeros_like(base), base, self.line_hz)
         return replace(full, effects=[effect for effect in full.effects if effect.name not in FIELD_EFFECTS])
+
+    def on_pixels_of(self, mask: Bools, values: Floats) -> Floats:
+        """Values (n, ...) of its own fluid pixels, on those of a mask (h, w); 0 where it has no fluid."""
+        own = self.observed.model.chip.mask
+        return values if own is mask else fluid_image(own, values)[mask]
 
     def unknowns(self, *names: str) -> tuple[Floats, Floats]:
         """Mean (k,) and covariance (k, k) of the unknowns of effects; what there is not is left out."""
@@ -309,10 +324,13 @@ def _register(observed: Observed, z: Floats, evidence: EffectModel) -> Observed 
 
 def _iterate_remainder(observed: Observed, robust: Robust, state: State, steps: Steps) -> State:
     """The state with the nonlinear remainder of its most probable unknowns."""
-    model = observed.model
+    model, last = observed.model, np.inf
     for _ in range(steps.most):
         z = state.evidence.most_probable(state.sizes)
         remainder = model.expansion.approach(model.prior.offset(z[: len(model.known)]), state.remainder)
+        if not remainder.step < GROWTH * last:  # inertia for which frozen factors are too far off
+            break
+        last = remainder.step
         nonlinear = model.expansion.pixels(remainder.flux)
         shift = averages(robust, observed.operator) @ observed.operator.predict(nonlinear - state.nonlinear).ravel()
         evidence = replace(state.evidence, y=state.evidence.y - shift)
@@ -330,7 +348,11 @@ def _flow(observed: Observed, z: Floats, in_use: Floats, nonlinear: Floats) -> F
     wider = WALLS_LONG * z[known + cells : known + 2 * cells] * model.widening
     flow = model.base + nonlinear + np.tensordot(z[:known], model.known, axes=1)
     flow = flow + np.tensordot(z[known : known + cells] - 3.0 * wider, model.resistance, axes=1)
-    return np.asarray(flow - (wider @ model.cells)[:, None] * in_use)
+    flow = flow - (wider @ model.cells)[:, None] * in_use
+    if observed.wall_mode is not None:
+        # The bias counts from the walls as they were drawn, the flow of the model is that in its own walls.
+        flow = flow + (z[known + 2 * cells] - model.chip.wall_offset_px) * observed.wall_mode
+    return np.asarray(flow)
 
 
 def _evidence(
@@ -339,7 +361,11 @@ def _evidence(
     """The observations, averaged, and the effects on them."""
     here = observed.operator
     average = averages(robust, here)
-    misfit = observed.misfit(observed.model.base + nonlinear, in_use)
+    model = observed.model
+    drawn = model.base + nonlinear
+    if observed.wall_mode is not None:  # its unknown counts from walls without a bias
+        drawn = drawn - model.chip.wall_offset_px * observed.wall_mode
+    misfit = observed.misfit(drawn, in_use)
     noise = np.repeat(robust.factor**2 * robust.variance / robust.inlier, 2)
     effects = [
         replace(

@@ -35,24 +35,26 @@ def flow_uncertainty(
             return FlowUncertainty(
                 model.base, columns, rolled, _block_diagonal(covariance, np.diag([GAIN[0] ** 2])), left
             )
-        # The pixels of a chip with other walls are not those of the chip.
         operator = settings.with_shaking(operator, chip, solver)
-        every = replace(settings, doubt_walls=False).hypotheses(operator, chip, solver)
+        every = settings.hypotheses(operator, chip, solver)
     except FlowError:
         return None
     best = every.best
     doubts = doubted_places(best.observed, best.robust, solver, OBSTACLE_SHARE)
+    changes = [best.on_pixels_of(chip.mask, change) for change in doubts.changes_um_s]
+    if changes:
+        doubts = replace(doubts, changes_um_s=np.stack(changes))
     return replace(_of(every), doubts=doubts)
 
 
 def _of(every: Hypotheses) -> FlowUncertainty:
-    best = every.best
-    columns, mean = field_columns(best), every.flow
+    best, mean, flows = every.best, every.flow, every.flows
+    columns = np.stack([best.on_pixels_of(every.mask, column) for column in field_columns(best)])
     count = len(columns)
     gain = _gain_index(every)
     index = [*range(count), *([] if gain is None else [gain])]
     covariance = best.posterior.covariance[np.ix_(index, index)]
-    apart = [np.sqrt(weight) * (one.flow - mean) for one, weight in zip(every.found, every.weights, strict=True)]
+    apart = [np.sqrt(weight) * (flow - mean) for flow, weight in zip(flows, every.weights, strict=True)]
     if len(apart) > 1:
         columns = np.concatenate([columns, np.stack(apart)])
         moved = np.zeros((len(covariance) + len(apart),) * 2)
@@ -63,7 +65,7 @@ def _of(every: Hypotheses) -> FlowUncertainty:
         covariance = moved
     rolled = np.ones((0 if gain is None else 1, len(mean)))
     factor = best.robust.factor * best.size(NOISE[0])
-    left = _error_std(left_variance(best))
+    left = _error_std(best.on_pixels_of(every.mask, left_variance(best)))
     return FlowUncertainty(mean, columns, rolled, covariance, left, factor, registration=best.registration)
 
 

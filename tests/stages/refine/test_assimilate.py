@@ -311,3 +311,9 @@ def test_less_what_the_registration_does_the_observations_lie_on_the_flow(twin):
     stated = operator.with_walls(every.best.observed.model.expansion.wall_px).on_fluid(case.chip.mask)
     off = flow_um_s - stated.predict(every.best.flow)
     assert np.sqrt((off**2).mean()) < 0.01 * np.sqrt((flow_um_s**2).mean())
+
+
+def test_a_fit_whose_inertia_frozen_factors_can_not_follow_keeps_the_last_step_that_shrank(twin):
+    case = twin(noise=0.01, scale=4000.0, assumed=(60.0, 0.0, 0.0))  # Re of 270, from half of it
+    refined = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+    assert case.error(refined) < 0.2 * case.error(case.assumed)

@@ -1,0 +1,80 @@
+"""Walls that all lie the same distance off: the chip, the first order of its flow, and what is found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.core.errors import FlowError
+from flowrec.core.messages import Observations
+from flowrec.physics.chip.chip import Chip, Opening
+from flowrec.physics.flow.sampling import sample
+from flowrec.physics.flow.solver import FlowSolver
+from flowrec.physics.flow.wall_offset import with_wall_offset
+from flowrec.stages.refine import Refiner
+from flowrec.stages.refine.wall_bias import nearest_offset, wall_mode
+
+WIDTH_PX, SPEED_UM_S = 12, 100.0
+
+
+def channel(walls: str = "smooth") -> Chip:
+    mask = np.zeros((30, 60), bool)
+    mask[9 : 9 + WIDTH_PX] = True
+    openings = (Opening("left", 9, 20, "inlet", SPEED_UM_S), Opening("right", 9, 20, "outlet", 0.0))
+    return Chip("channel", mask, 10.0, openings, 1.0, 1000.0, walls=walls)
+
+
+def across_um_s(chip: Chip, k: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of the pixels in the middle column from the channel's axis, px, and the speed there."""
+    field = FlowSolver(k).solve(chip)
+    return np.arange(30) - 14.5, field.velocity_um_s[:, 30, 0]
+
+
+@pytest.mark.parametrize("walls", ["smooth", "pixel"])
+@pytest.mark.parametrize("offset_px", [-1.5, -1.0, -0.5, 0.5, 1.0, 1.5])
+def test_walls_moved_by_an_offset_carry_the_same_flow_rate_in_the_parabola_of_the_wider_channel(walls, offset_px):
+    chip = with_wall_offset(channel(walls), offset_px)
+    y, speed = across_um_s(chip)
+    half = 0.5 * WIDTH_PX + offset_px
+    expected = 1.5 * SPEED_UM_S * WIDTH_PX / (2.0 * half) * np.maximum(1.0 - (y / half) ** 2, 0.0)
+    assert np.abs(speed - expected).max() < 0.005 * SPEED_UM_S
+    assert chip.boundary_values[0] * chip.openings[0].width_px == pytest.approx(SPEED_UM_S * WIDTH_PX)
+    assert with_wall_offset(chip, -offset_px).mask.tobytes() == channel().mask.tobytes()
+
+
+def test_an_offset_that_closes_an_opening_is_refused_with_its_size():
+    with pytest.raises(FlowError, match=r"walls moved by -6 px: an opening closes"):
+        with_wall_offset(channel("pixel"), -6.0)
+
+
+def test_the_first_order_of_the_flow_is_the_derivative_of_the_parabola_at_the_same_flow_rate():
+    chip = channel()
+    mode = np.zeros((*chip.mask.shape, 2))
+    mode[chip.mask] = wall_mode(chip, FlowSolver(2))
+    y, half = np.arange(30) - 14.5, 0.5 * WIDTH_PX
+    expected = 1.5 * SPEED_UM_S / half * (3.0 * (y / half) ** 2 - 1.0)
+    inside = np.abs(y) < half - 1.0  # beside the wall the second order counts
+    assert np.allclose(mode[inside, 30, 0], expected[inside], atol=0.01 * SPEED_UM_S)
+
+
+def test_offsets_are_tried_at_steps_and_never_beyond_the_largest():
+    assert [nearest_offset(found) for found in (0.1, -0.3, 0.8, 7.0)] == [0.0, -0.5, 1.0, 2.0]
+
+
+def test_a_threshold_that_is_off_by_a_fraction_of_a_pixel_is_found_with_the_flow_through_the_true_walls():
+    chip, solver = channel(), FlowSolver(2)
+    true = solver.solve(with_wall_offset(chip, 0.7))
+    y = np.tile(np.linspace(-45.0, 45.0, 13), 5)
+    places = np.column_stack([np.repeat(np.linspace(150.0, 450.0, 5), 13), 145.0 + y])
+    std = np.full(len(places), 2.0)
+    flow = sample(true, places) + 2.0 * np.random.default_rng(2).standard_normal(places.shape)
+    refined = Refiner().refine(solver.solve(chip), Observations(0, places, flow, std), chip, solver)
+    assert "too narrow on each side" in refined.note
+    off = (refined.velocity_um_s - true.velocity_um_s)[chip.mask]
+    assert np.sqrt((off**2).sum() / (true.velocity_um_s[chip.mask] ** 2).sum()) < 0.02
+    assert (np.abs(off) < 2.0 * refined.std_um_s[chip.mask]).mean() > 0.9
+    # Of walls that are as drawn nothing is said.
+    drawn = solver.solve(chip)
+    flow = sample(drawn, places) + 2.0 * np.random.default_rng(2).standard_normal(places.shape)
+    same = Refiner().refine(drawn, replace(Observations(0, places, flow, std)), chip, solver)
+    assert "mask" not in same.note
