@@ -6,6 +6,7 @@ own, so that peak memory is that of the method.
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -18,7 +19,8 @@ import numpy as np
 import typer
 
 from flowrec.bench.figure_flow import FlowPanels, draw, median_case
-from flowrec.bench.harness import Cases, FigureFile, Names, Results, choose_names, print_rows, vessel_cases
+from flowrec.bench.harness import Cases, FigureFile, Names, Results, choose_names, flow_scores, print_rows, vessel_cases
+from flowrec.bench.null_models import NULL_MODELS, NullModel
 from flowrec.bench.vessel_truth import read_observations, read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
 from flowrec.core import (
@@ -37,11 +39,13 @@ from flowrec.stages import REFINERS, PiUnet, Refiner, Trimmed, with_row
 
 RANDOM_CASES = 10
 
-# The rows of REFINERS; fvm, no refinement, is the null model. As in the paper, pi_unet starts from the solver's field.
-# `:printed` has random weights and no other optimiser than the paper's.
-METHODS = {name: with_row(Refiner(pi_unet=PiUnet(start="fvm")), REFINERS, name) for name in REFINERS.usable()} | {
+# The rows of REFINERS, of which fvm, no refinement, and gain are null models, and those of null_models.py. As in the
+# paper, pi_unet starts from the solver's field. `:printed` has random weights and no other optimiser than the paper's.
+METHODS: dict[str, Refiner | NullModel] = {
+    **{name: with_row(Refiner(pi_unet=PiUnet(start="fvm")), REFINERS, name) for name in REFINERS.usable()},
     "pi_unet:printed": Refiner("pi_unet", pi_unet=PiUnet(start="fvm", weights="none", finish="none")),
     "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
+    **{name: NullModel(name) for name in NULL_MODELS},
 }
 _INCREMENTAL = ("fvm", "assimilate")  # an update reuses earlier results; the others start again
 
@@ -54,7 +58,8 @@ class Scenario:
     share: str = "10"  # part of the skeleton that is observed, %
     k: int = 2
     outliers: float = 0.0  # fraction of the observations
-    mask: str = "right"  # grown, shrunk: walls one pixel off everywhere; shifted: one pixel to the right
+    # grown, shrunk: walls one pixel off everywhere; shifted: one pixel to the right; otsu, adaptive: from a picture
+    mask: str = "right"
     observations: str = "raw"  # trimmed: outliers removed as in the paper
 
     def observe(self, case: Path) -> Observations:
@@ -72,7 +77,8 @@ def measure(
     k: Annotated[int, typer.Option("-k", help="Subcells of the solver per pixel side: 1, 2 or 4.")] = 2,
     outliers: Annotated[float, typer.Option(help="Fraction of the observations that are outliers.")] = 0.0,
     mask: Annotated[
-        Literal["right", "grown", "shrunk", "shifted"], typer.Option(help="Error of the assumed walls, of one pixel.")
+        Literal["right", "grown", "shrunk", "shifted", "otsu", "adaptive"],
+        typer.Option(help="Error of the assumed walls: of one pixel, or those of a picture by a threshold."),
     ] = "right",
     observations: Annotated[
         Literal["raw", "trimmed"], typer.Option(help="trimmed: outliers are removed as in the paper.")
@@ -148,8 +154,7 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
 
     `rmse_*` are relative RMSE over the fluid pixels of the true mask. `seconds` and `cpu_seconds` include the first
     solution of the flow; `seconds_update` is the time for other observations of the same case, with filled caches.
-    `within_2_std` is the fraction of the components within two stated standard deviations, `stated_rmse_v` the rmse_v
-    that these state, `peak_mb` the peak memory of this process.
+    `within_2_std`, `stated_over_true` and `crps` are those of `flow_scores`, `peak_mb` the peak memory of this process.
     """
     chip = read_vessel_case(case)
     observations = scenario.observe(case)
@@ -171,38 +176,45 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
             np.savez_compressed(file, velocity_um_s=field.velocity_um_s, mask=chip.mask)
     true = read_true_velocity(case)
     error = relative_rmse(field, replace(field, velocity_um_s=true.astype(np.float32)), chip.mask)
-    within = stated = None
-    if field.std_um_s is not None:
-        std = field.std_um_s[chip.mask]
-        within = float((np.abs(field.velocity_um_s - true)[chip.mask] <= 2.0 * std).mean())
-        stated = float(np.sqrt((std.astype(np.float64) ** 2).sum() / (true[chip.mask] ** 2).sum()))
+    scores = flow_scores(field, true, chip.mask)
     return {
         **{"case": case.stem, "method": method},
         **{"rmse_vx": error.vx, "rmse_vy": error.vy, "rmse_v": error.v},
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "seconds_update": seconds_update,
-        "within_2_std": within,
-        "stated_rmse_v": stated,
+        "within_2_std": scores["within_2_sigma"],
+        "stated_over_true": scores["stated_over_true"],
+        "crps": scores["crps"],
         "peak_mb": peak_mb(),
         "note": field.note,
     }
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Mean, standard deviation and median over cases; `mean` and `std` are those of rmse_v."""
+    """Mean, standard deviation and median over cases; `mean` and `std` are those of rmse_v.
+
+    `stated_over_true` is the root mean square of the stated errors over that of the errors.
+    """
     of = {key: [row[key] for row in rows] for key in rows[0]}
     moments: dict[str, float | None] = {}
     for name in ("rmse_vx", "rmse_vy", "rmse_v"):
         moments |= {f"{name}_mean": float(np.mean(of[name])), f"{name}_std": float(np.std(of[name]))}
-    covered = [value for value in of["within_2_std"] if value is not None]
+    stated = [
+        (error, within, ratio)
+        for error, within, ratio in zip(of["rmse_v"], of["within_2_std"], of["stated_over_true"], strict=True)
+        if ratio is not None
+    ]
+    errors, covered, ratios = np.array(stated).reshape(-1, 3).T
     return moments | {
         "mean": moments["rmse_v_mean"],
         "std": moments["rmse_v_std"],
         "worst": max(of["rmse_v"]),
         **{f"median_{name}": float(np.median(of[name])) for name in ("seconds", "cpu_seconds", "seconds_update")},
         "peak_mb": max(of["peak_mb"]),
-        "within_2_std": float(np.mean(covered)) if covered else None,
+        "within_2_std": float(covered.mean()) if stated else None,
+        "stated_over_true": math.hypot(*(errors * ratios)) / math.hypot(*errors) if stated else None,
+        "crps": float(np.mean(of["crps"])),
     }
 
 
@@ -246,12 +258,15 @@ def _field_path(fields: Path, case: Path, method: str) -> Path:
 def show(results: Results) -> None:
     """Print Table I; the seconds of an update and the single cases are in the JSON."""
     cases = {row["case"] for row in results["rows"]}
-    components = {name: f"{{rmse_{name}_mean:.3f}}±{{rmse_{name}_std:.3f}}" for name in ("vx", "vy", "v")}
+    components = {name: f"{{rmse_{name}_mean:.3f}}" for name in ("vx", "vy")}
+    components["v"] = "{rmse_v_mean:.3f}±{rmse_v_std:.3f}"
     print_rows(
-        f"Relative RMSE over {len(cases)} cases, noise {results['noise']} %, {results['share']} % of the route seen",
+        f"Relative RMSE over {len(cases)} cases, noise {results['noise']} %, {results['share']} % of the route seen; "
+        "2 std: share of the components; stated: over the true error",
         [{"method": method, **line} for method, line in results["summary"].items()],
         {
-            **{"method": "{method}", **components, "worst v": "{worst:.3f}", "in 2 std": "{within_2_std:.0%}"},
+            **{"method": "{method}", **components, "worst": "{worst:.3f}", "CRPS": "{crps:.4f}"},
+            **{"2 std": "{within_2_std:.0%}", "stated": "{stated_over_true:.2f}"},
             **{"s": "{median_seconds:.3g}", "MB": "{peak_mb:.0f}"},
         },
     )

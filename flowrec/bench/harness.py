@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Annotated, Any, get_origin
 
 import numpy as np
+import scipy  # its special loads at first use, not at start-up
 import typer
 from numpy.typing import NDArray
 from typer.core import TyperCommand
 
-from flowrec.core import FIGURE, JSON, FlowrecError, Output, StoppedError, UsageError, looked_at, say, table
+from flowrec.core import FIGURE, JSON, FlowField, FlowrecError, Output, StoppedError, UsageError, looked_at, say, table
 from flowrec.verbs import HELP_WIDTH, AsJson, Overwrite, Stoppable
 
 Results = dict[str, Any]
@@ -159,6 +160,33 @@ def vessel_cases(folder: Path) -> list[Path]:
     if not cases:
         raise UsageError(f"{folder}: no vessel case (*.npz) in it")
     return cases
+
+
+def flow_scores(found: FlowField, truth: NDArray[np.floating], mask: NDArray[np.bool_]) -> dict[str, float | None]:
+    """Scores of a field over the components of the pixels of a mask (h, w); `truth` (h, w, 2) in um/s.
+
+    error : relative RMSE of v. within_2_sigma : fraction of the components within two stated standard deviations of the
+    truth. stated_over_true : root mean square of the stated standard deviations over that of the errors; both None if
+    none are stated. crps : continuous ranked probability score of the Gaussian (Gneiting and Raftery 2007, eq. 21),
+    mean over the components, over the rms speed; without a standard deviation that is the mean absolute error.
+    """
+    true = truth[mask].astype(np.float64)
+    off = found.velocity_um_s[mask].astype(np.float64) - true
+    rms, error = (math.sqrt(float((each**2).sum(axis=1).mean())) for each in (true, off))
+    within, stated, crps = None, None, np.abs(off)
+    if found.std_um_s is not None:
+        std = np.maximum(found.std_um_s[mask].astype(np.float64), 1e-9)
+        within = float((np.abs(off) <= 2.0 * std).mean())
+        stated = math.sqrt(float((std**2).sum(axis=1).mean())) / max(error, 1e-12)
+        z = off / std
+        density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
+        crps = std * (z * (2.0 * scipy.special.ndtr(z) - 1.0) + 2.0 * density - 1.0 / math.sqrt(math.pi))
+    return {
+        "error": error / rms,
+        "within_2_sigma": within,
+        "stated_over_true": stated,
+        "crps": float(crps.mean()) / rms,
+    }
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:

@@ -6,14 +6,16 @@ solver.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label
 from scipy.sparse.csgraph import dijkstra
 
 from flowrec.bench.vessel_truth import NOISES, SHARES
@@ -22,6 +24,7 @@ from flowrec.physics import (
     Chip,
     FlowSolver,
     Opening,
+    Walls,
     border,
     draw_channel,
     find_openings,
@@ -32,12 +35,42 @@ from flowrec.physics import (
 SIDE_PX = 128
 Mask = NDArray[np.bool_]
 
-# A mask whose walls are drawn one pixel off, by name.
+
+def photograph(mask: Mask, blur_px: float = 1.0) -> NDArray[np.uint8]:
+    """A picture (h, w) of dark channels: out of focus, lit from one side, with 1 % noise; one mask has one picture."""
+    rng = np.random.default_rng(zlib.crc32(mask.tobytes()))
+    fine, beyond = 4, 8  # subpixels, and pixels beyond the border over which channels go on
+    drawn = np.pad(mask, beyond, mode="edge").repeat(fine, axis=0).repeat(fine, axis=1).astype(np.float64)
+    drawn = gaussian_filter(drawn, fine * blur_px)
+    h, w = (size + 2 * beyond for size in mask.shape)
+    seen = drawn.reshape(h, fine, w, fine).mean(axis=(1, 3))[beyond:-beyond, beyond:-beyond]
+    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]] / max(mask.shape)
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    light = (0.65 - 0.3 * seen) * (1.0 + 0.15 * (np.cos(angle) * x + np.sin(angle) * y))
+    return np.asarray(np.clip(255.0 * (light + rng.normal(0.0, 0.01, mask.shape)), 0, 255), np.uint8)
+
+
+def threshold_by_otsu(mask: Mask) -> Mask:
+    """The mask that one threshold for the whole picture gives."""
+    smooth = cv2.GaussianBlur(photograph(mask), (0, 0), 0.7)
+    return _largest(cv2.threshold(smooth, 0, 1, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)[1].astype(bool))
+
+
+def threshold_by_neighbours(mask: Mask) -> Mask:
+    """The mask of the pixels that are darker than the 31 x 31 pixels around them."""
+    smooth = cv2.GaussianBlur(photograph(mask), (0, 0), 0.7)
+    kind = cv2.ADAPTIVE_THRESH_MEAN_C
+    return _largest(cv2.adaptiveThreshold(smooth, 1, kind, cv2.THRESH_BINARY_INV, 31, 3).astype(bool))
+
+
+# A mask whose walls are drawn one pixel off, or that of a picture, by name.
 MASK_ERRORS: dict[str, Callable[[Mask], Mask]] = {
     "right": lambda mask: mask,
     "grown": binary_dilation,
     "shrunk": lambda mask: binary_erosion(mask, border_value=1),
     "shifted": lambda mask: np.concatenate([mask[:, :1], mask[:, :-1]], axis=1),
+    "otsu": threshold_by_otsu,
+    "adaptive": threshold_by_neighbours,
 }
 _LONGEST_ROUTE_PX = 160
 _LETTER = {"left": "W", "right": "E", "top": "S", "bottom": "N"}
@@ -164,7 +197,10 @@ def _route_observations(
 
 
 def with_mask_error(chip: Chip, error: str) -> Chip:
-    """The chip as drawn with one of MASK_ERRORS; its openings move to where the border of the new mask is open."""
+    """The chip as drawn with one of MASK_ERRORS; its openings move to where the border of the new mask is open.
+
+    Walls of a picture are smooth, as those of any mask that a user brings.
+    """
     mask = MASK_ERRORS[error](chip.mask)
     openings = []
     for opening in chip.openings:
@@ -172,7 +208,8 @@ def with_mask_error(chip: Chip, error: str) -> Chip:
         # A closed opening stays one solid pixel wide; the solver refuses it by name.
         first, last = run_around(border(mask, opening.side), middle) or (middle, middle)
         openings.append(replace(opening, first=first, last=last))
-    return replace(chip, mask=mask, openings=tuple(openings))
+    walls: Walls = "smooth" if error in ("otsu", "adaptive") else chip.walls
+    return replace(chip, mask=mask, openings=tuple(openings), walls=walls)
 
 
 def thin(mask: Mask) -> Mask:

@@ -12,9 +12,10 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
 
+from flowrec.bench.harness import flow_scores
+from flowrec.bench.null_models import NULL_MODELS, NullModel
 from flowrec.bench.planted_causes import count_causes, planted_causes
 from flowrec.core import BY_FIELD, FlowField, FlowrecError, Phase, Tick, WorkOrder, message_fields, seconds
 from flowrec.physics import Chip, load_chip
@@ -215,42 +216,36 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
     planted = planted_causes(config, chip)
     flight.refined["assumed"] = score_field(order.assumed, truth, chip.mask)
     for method in methods:
-        refiner = replace(config.refine, method=method, adopt="always")  # what the method gives, good or bad
         try:
-            result = work(replace(pipeline, refiner=refiner), order)
+            result = _refine_order(order, pipeline, config, chip, method)
         except FlowrecError as error:
             flight.refined[method] = {"failed": str(error)}
             continue
-        assert isinstance(result, FlowField)
         flight.refined[method] = score_field(result, truth, chip.mask, planted)
+
+
+def _refine_order(order: Tick, pipeline: Pipeline, config: ResolvedConfig, chip: Chip, method: str) -> FlowField:
+    """What a refiner or a null model gives for a work order, good or bad."""
+    if method in NULL_MODELS:
+        assert order.assumed is not None and order.observations is not None
+        return NullModel(method).refine(order.assumed, order.observations, chip, pipeline.solver)
+    refiner = replace(config.refine, method=method, adopt="always")
+    result = work(replace(pipeline, refiner=refiner), order)
+    assert isinstance(result, FlowField)
+    return result
 
 
 def score_field(
     found: FlowField, truth: NDArray[np.float32], mask: NDArray[np.bool_], planted: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Scores of a field over the components of the fluid pixels.
+    """`flow_scores` over the fluid pixels, and what the field says of itself.
 
-    error : relative RMSE of v. within_2_sigma : fraction of the components within two stated standard deviations of
-    the truth; None if none are stated. crps : continuous ranked probability score of the Gaussian (Gneiting and Raftery
-    2007, eq. 21), mean over the components, over the rms speed; without a standard deviation that is the mean
-    absolute error. warned : whether the note names a planted cause, on the right side; invented : clauses that name
-    another one (planted_causes.py).
+    expected : the error that it states. warned : whether the note names a planted cause, on the right side; invented :
+    clauses that name another one (planted_causes.py).
     """
-    true = truth[mask].astype(np.float64)
-    off = found.velocity_um_s[mask].astype(np.float64) - true
-    rms = math.sqrt(float((true**2).sum(axis=1).mean()))
-    score: dict[str, Any] = {"error": math.sqrt(float((off**2).sum(axis=1).mean())) / rms, "within_2_sigma": None}
-    crps = np.abs(off)
-    if found.std_um_s is not None:
-        std = np.maximum(found.std_um_s[mask].astype(np.float64), 1e-9)
-        score["within_2_sigma"] = float((np.abs(off) <= 2.0 * std).mean())
-        z = off / std
-        density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
-        crps = std * (z * (2.0 * scipy.special.ndtr(z) - 1.0) + 2.0 * density - 1.0 / math.sqrt(math.pi))
-    score["crps"] = float(crps.mean()) / rms
-    score["expected"] = getattr(found, "error_share", None)
     right, invented = count_causes(found.note, planted)
-    return score | {"warned": right > 0, "invented": invented, "note": found.note}
+    said = {"expected": found.error_share, "warned": right > 0, "invented": invented, "note": found.note}
+    return flow_scores(found, truth, mask) | said
 
 
 def _as_json(message: Any) -> dict[str, Any]:

@@ -21,13 +21,15 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, choose_names, mean_with_interval, paired_ratio, print_rows
+from flowrec.bench.null_models import NULL_MODELS
 from flowrec.bench.world_flights import WORLDS, Flight, FlightCase, as_line, fly, refine
 from flowrec.core import UsageError, append_line, pool, progress, provenance, replace_content, say
 from flowrec.stages import REFINERS
 from flowrec.verbs import SetTexts
 
 CHIPS = "bifurcation,vessels-1,vessels-2,vessels-3"
-METHODS = [name for name in ("fvm", "gain", "assimilate", "pi_unet") if name in REFINERS]
+KNOWN = (*REFINERS, *NULL_MODELS)
+METHODS = [name for name in ("fvm", "gain", *NULL_MODELS, "assimilate", "pi_unet") if name in KNOWN]
 NULL = "gain"  # one factor for the whole assumed flow
 _WORSE = 1.0  # times the assumed error, above which a refined map is worse
 
@@ -53,7 +55,7 @@ def measure(
         If there is no such world or method, or `rows` is not a file of flights.
     """
     names = choose_names("bench worlds: no world", worlds, WORLDS)
-    wanted = choose_names("bench worlds: no method", methods, REFINERS)
+    wanted = choose_names("bench worlds: no method", methods, KNOWN)
     cases = [
         FlightCase(world, chip, seed, tuple(sets or ()))
         for seed in range(first_seed, first_seed + seeds)
@@ -177,7 +179,8 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
     worse : flights in which the refined error is larger than the assumed one; unsaid : those of them whose note does
     not name a planted cause. invented : flights whose note names a cause that is not there, or its wrong side.
     expected : the error that the fields state (error_share). over_null : error over that of `gain`, paired.
-    within_2_sigma : share of the components, all flights pooled with the same weight.
+    within_2_sigma : share of the components, all flights pooled with the same weight; stated_over_true : root mean
+    square of the stated errors over that of the true ones.
     """
     rows = [one.refined for one in flights if method in one.refined and "failed" not in one.refined[method]]
     mine = [row[method] for row in rows]
@@ -194,12 +197,20 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
         "expected": mean_with_interval(expected),
         "crps": mean_with_interval([one["crps"] for one in mine]),
         "within_2_sigma": float(np.mean(stated)) if stated else None,
+        "stated_over_true": _stated_over_true(mine),
         "worse": len(worse),
         "unsaid": sum(not one["warned"] for one in worse),
         "warned": sum(one["warned"] for one in mine),
         "invented": sum(one.get("invented", 0) > 0 for one in mine),
         "over_null": paired_ratio(np.array(pairs)) if pairs and method != NULL else None,
     }
+
+
+def _stated_over_true(mine: Sequence[Results]) -> float | None:
+    """Root mean square of the stated errors over that of the errors; None where a flight states none."""
+    pairs = [(one["error"], one["error"] * one["stated_over_true"]) for one in mine if one.get("stated_over_true")]
+    true, stated = np.array(pairs).reshape(-1, 2).T
+    return math.hypot(*stated) / math.hypot(*true) if pairs else None
 
 
 def show(results: Results) -> None:
@@ -218,13 +229,14 @@ def show(results: Results) -> None:
     print_rows(
         "Refined flow in worlds that are not the model's: relative RMSE in %, its mean over flights (bootstrap 95 %); "
         "worse: than assumed, unsaid: and its cause not named; named, invented: flights "
-        "with a sentence on a planted cause, on another one; 2 sigma: part of the components; CRPS in % of the speed",
+        "with a sentence on a planted cause, on another one; 2 sigma: part of the components; "
+        "stated: over the true error; CRPS in % of the speed",
         lines,
         {
             **{"world": "{world}", "method": "{method}", "assumed": "{before}", "refined": "{after}"},
             **{"95 %": "{interval}", f"/ {NULL}": "{ratio}", "worse": "{worse}", "unsaid": "{unsaid}"},
             **{"named": "{warned}", "invented": "{invented}"},
-            **{"2 sigma": "{covered}", "CRPS": "{score}"},
+            **{"2 sigma": "{covered}", "stated": "{stated}", "CRPS": "{score}"},
         },
     )
     print_rows(
@@ -254,5 +266,6 @@ def _line(world: str, method: str, found: Results) -> Results:
             "interval": f"{percent(low)}-{percent(high)}" if found["count"] else "-",
             "score": percent(found["crps"]["mean"]),
         },
+        "stated": f"{found['stated_over_true']:.2f}" if found["stated_over_true"] else "-",
         **{"covered": percent(found["within_2_sigma"], 0), "ratio": f"{ratio['mean']:.2f}" if ratio else "-"},
     }

@@ -3,6 +3,7 @@
 import pytest
 
 from flowrec.bench import flow, missions, observer, plan, track, worlds
+from flowrec.bench.null_models import NULL_MODELS
 from flowrec.stages.control.controller import CONTROLLERS
 from flowrec.stages.estimation.observer import OBSERVERS
 from flowrec.stages.planning import PLANNERS
@@ -15,6 +16,7 @@ def test_every_refiner_and_every_planner_has_a_row():
     assert all(plan.METHODS[name].method == name for name in PLANNERS)
     assert "fvm" in flow.METHODS and "astar_length" in plan.METHODS, "null models"
     assert "fvm" in worlds.METHODS and ("gain" in worlds.METHODS) == ("gain" in REFINERS), "null models"
+    assert set(NULL_MODELS) <= set(worlds.METHODS) & set(flow.METHODS)
 
 
 @pytest.mark.slow("a bench of every observer")

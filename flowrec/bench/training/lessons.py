@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.bench.vessel_truth import NOISES, SHARES, read_true_velocity
-from flowrec.bench.vessels import MASK_ERRORS, draw_mask, make_case, with_mask_error
+from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
 from flowrec.core import FlowField, FlowrecError, Observations, UsageError, replacing
 from flowrec.physics import Chip, FlowSolver, read_vessel_case
 from flowrec.stages import ObservationOperator, observation_operator
 
+_MASK_ERRORS = ("grown", "shrunk", "shifted")  # of those that are drawn
 _MASK_ERROR_PROBABILITY = 0.15
 _OUTLIER_PROBABILITY = 0.25  # of one set of observations; up to a seventh of them are outliers then
 _SOLVER = FlowSolver(2)
@@ -72,7 +73,7 @@ def _make(path: Path, rng: np.random.Generator) -> None:
             case = make_case(draw_mask(rng), rng, truth_k=2)
             if case is None:
                 continue
-            error = str(rng.choice(list(MASK_ERRORS)[1:])) if rng.random() < _MASK_ERROR_PROBABILITY else "right"
+            error = str(rng.choice(_MASK_ERRORS)) if rng.random() < _MASK_ERROR_PROBABILITY else "right"
             with part.open("wb") as file:
                 np.savez(file, allow_pickle=False, **case)
             try:
