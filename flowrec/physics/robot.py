@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from flowrec.core import PositiveShare, Range
+from flowrec.core import FlowField, PositiveShare, Range
 
+UM_PER_REV = "um_per_rev_share"  # of FlowField.parameter_names: the true one over the stated one, less 1
+_SIGNIFICANT = 2.0  # standard deviations
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
 
 _Radius = Annotated[float, Range(0.05, 1e4)]
@@ -52,6 +54,21 @@ class Robot(RobotSettings):
     def slowed_to(self, speed_um_s: float | None) -> Robot:
         """A copy that is never commanded to swim faster than a speed; None: without that limit."""
         return self if speed_um_s is None else replace(self, max_speed_um_s=min(speed_um_s, self.max_speed_um_s))
+
+    def learned_from(self, refined: FlowField | None) -> Robot:
+        """A copy with the um per revolution that a refinement found, where that is significant.
+
+        A robot that moves less per revolution is slower, one that moves more is not commanded to swim faster.
+        """
+        names = [] if refined is None else refined.parameter_names.split("; ")
+        if refined is None or UM_PER_REV not in names:
+            return self
+        index = names.index(UM_PER_REV)
+        change, std = float(refined.parameters[index]), float(refined.parameter_std[index])
+        if abs(change) <= _SIGNIFICANT * std or change <= -1.0:
+            return self
+        slower = min(1.0 + change, 1.0)
+        return replace(self, max_speed_um_s=slower * self.max_speed_um_s, um_per_rev=(1.0 + change) * self.um_per_rev)
 
     def speed_limit_at(self, strength: float) -> float:
         """Speed limit in a field of this fraction of the full amplitude, um/s: step-out falls with the torque."""

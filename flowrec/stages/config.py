@@ -162,6 +162,7 @@ _BEFORE: dict[str, Any] = {
     "health.step_out.learned": False,
     "sampler.without_map": False,
     "refine.place_robot": False,
+    "refine.correct_robot": False,
     "refine.adopt": "always",
     "mission.wait_at_goal_s": 0.0,
     "recording.admission_s": 0.0,

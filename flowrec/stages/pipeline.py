@@ -300,9 +300,10 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     track, appearance = sight.track, sight.appearance
     assert track is not None, "the tracker says of every image whether it shows the robot"
     lap("track")
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow, last.health)
+    known = p.robot.learned_from(tick.refined) if p.refiner.correct_robot else p.robot
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, known, flow, last.health)
     # The robot with the estimated um_per_rev, if the observer estimates it.
-    robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
+    robot = known if estimate.um_per_rev is None else replace(known, um_per_rev=estimate.um_per_rev)
     # Sessions recorded before step-out was monitored replay without it.
     looked = inputs.applied if inputs.applied.image_since_ns is not None else None
     # Observations, their predictions and the pictures keep to the registration as stated.
@@ -310,11 +311,15 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     wall_um = _wall_um(p, placed.position_um)
     health = last.health
     if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
-        health = p.health.watch(health, last.estimate, estimate, flow, p.robot, looked, wall_um)
+        health = p.health.watch(health, last.estimate, estimate, flow, known, looked, wall_um)
     robot = robot.limited_to(health.limit_hz)
     mapless, measured = last.mapless, estimate
     if p.sampler.without_map:
-        mapless = p.observer.without_map(last.mapless, last.estimate, estimate, track, inputs.applied, p.robot)
+        # Observations are those of the robot as stated: what a refinement finds of it, the next one finds again.
+        corrected = known is not p.robot
+        mapless = p.observer.without_map(
+            last.mapless, last.estimate, estimate, track, inputs.applied, p.robot, corrected=corrected
+        )
         measured = p.observer.measured_estimate(mapless, estimate)
     before = None if last.estimate is None else p.observer.measured_estimate(last.mapless, last.estimate)
     observations = p.sampler.collect(last.observations, before, measured, p.robot)

@@ -37,3 +37,33 @@ def test_mission_and_controller_place_the_robot_by_the_registration_that_was_fou
     moved = stepped(np.column_stack((np.eye(2), beside)))
     assert moved.demand.error_um == pytest.approx(float(np.hypot(*(seen + beside - moved.demand.reference_um))))
     assert moved.demand.velocity_um_s[1] < plain.demand.velocity_um_s[1]  # back to the route
+
+
+def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no_observation(session):
+    recorded = flowrec.open(session)
+    ticks = [tick for tick in recorded.ticks() if tick.mission and tick.mission.phase == Phase.NAVIGATE]
+    pipeline = assemble(recorded.config, recorded.chip)
+
+    def flown(change, std=0.01, pipeline=pipeline):
+        """The mission from a tick on, over some frames, with a map that found that much of the robot."""
+        found = replace(ticks[3].field, parameter_names="depth_um; um_per_rev_share")
+        found = replace(found, parameters=np.array([90.0, change]), parameter_std=np.array([9.0, std]))
+        last = replace(ticks[3], refined=found)
+        for now in ticks[4:30]:
+            last = step(pipeline, last, Inputs(now.stamp_ns, now.frame, now.applied))
+        return last
+
+    plain, corrected = flown(0.0), flown(-0.2)
+    # A robot that rolls less is carried more along its course: the motion that was seen is the sum of both.
+    less = corrected.estimate.rolled_um_s - plain.estimate.rolled_um_s
+    assert np.allclose(less, -0.2 * plain.estimate.rolled_um_s, atol=0.02 * np.hypot(*plain.estimate.rolled_um_s))
+    assert (corrected.estimate.flow_um_s - plain.estimate.flow_um_s) @ less < -0.7 * less @ less
+    turns = [tick.currents.frequency_hz / np.hypot(*tick.demand.velocity_um_s) for tick in (plain, corrected)]
+    assert turns[1] == pytest.approx(turns[0] / 0.8, rel=1e-3)
+    # What the next refinement is given is of the robot as it is stated: adopting a map twice corrects nothing twice.
+    assert len(plain.observations.position_um) > len(ticks[3].observations.position_um)
+    assert corrected.observations.same_as(plain.observations)
+
+    assert flown(-0.02, std=0.02).estimate.same_as(plain.estimate), "no more than its error"
+    stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_robot=False))
+    assert flown(-0.2, pipeline=stated).estimate.same_as(plain.estimate)

@@ -93,6 +93,8 @@ class Observer:
         track: Track,
         applied: Applied,
         robot: Robot,
+        *,
+        corrected: bool = False,
     ) -> Estimate | None:
         """The estimate of the same filter without a map, while `estimate` corrects one; else `previous` itself.
 
@@ -103,8 +105,10 @@ class Observer:
         ----------
         previous : what this method returned last.
         before : the estimate of the frame before, from which the filter continues where that did not use a map.
+        robot : as it is stated.
+        corrected : `estimate` is that of a robot that a refinement has corrected; this one never is.
         """
-        if not corrects_map(estimate):
+        if not corrected and not corrects_map(estimate):
             return previous
         if before is not None:
             before = self.measured_estimate(previous, before)

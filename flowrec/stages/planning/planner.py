@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from dataclasses import field as setting
 from typing import Annotated, Literal, Protocol
 
@@ -75,10 +75,6 @@ PLANNERS = Methods(
     group="flowrec.planners",
     verb="plan",
 )
-
-
-_UM_PER_REV = "um_per_rev_share"  # of FlowField.parameter_names: the true one over the stated one, less 1
-_SIGNIFICANT = 2.0  # standard deviations
 
 
 class PlanningMethod(Protocol):
@@ -185,19 +181,9 @@ class Planner:
 
 
 def _as_found(robot: Robot, field: FlowField) -> Robot:
-    """The robot with the smaller um per revolution that the refinement of a field has found: it is that much slower.
-
-    A larger one is not counted on: the coils turn no faster than the stated one asks for.
-    """
-    names = field.parameter_names.split("; ")
-    if _UM_PER_REV not in names:
-        return robot
-    k = names.index(_UM_PER_REV)
-    change, std = float(field.parameters[k]), float(field.parameter_std[k])
-    if not -1.0 < change < -_SIGNIFICANT * std:
-        return robot
-    slower = 1.0 + change
-    return replace(robot, max_speed_um_s=slower * robot.max_speed_um_s, um_per_rev=slower * robot.um_per_rev)
+    """The robot with the smaller um per revolution that the refinement of a field has found; no plan needs a larger."""
+    found = robot.learned_from(field)
+    return found if found.um_per_rev < robot.um_per_rev else robot
 
 
 def warm_up() -> None:
