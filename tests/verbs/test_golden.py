@@ -52,14 +52,16 @@ def test_the_golden_session_replays_the_same_but_for_the_meaning_of_its_fields(f
     assert done.recorded.mission.outcome == "reached"
 
 
-def test_the_golden_session_of_the_moderate_world_replays_the_same() -> None:
+def test_the_golden_session_of_the_moderate_world_replays_the_same_but_for_what_newer_numerics_find() -> None:
     done = verb.replay_session(MODERATE, Change(), verify=True)
     lines = done.lines()
     assert done.comparison.same and done.digest[0], lines
     assert done.worker is not None
-    assert done.same, lines  # on other processors within tolerance
+    different = {path for path, count in done.worker.comparison.topics.items() if count.different}
+    assert different <= {"/plan/route", "/flow/refined"}, lines  # by the survey and by the refinement
+    assert "results of the worker made by other numerics (recorded: version 3, replayed: version 4)" in lines[-1]
     routes = done.worker.comparison.topics["/plan/route"]
-    assert routes.identical + routes.within_tolerance > 3
+    assert routes.identical + routes.within_tolerance > 0  # the way to the goal in the recorded map
     assert done.recorded.mission is not None
     assert done.recorded.mission.outcome == "reached"
 

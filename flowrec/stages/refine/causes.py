@@ -126,10 +126,13 @@ class Observed:
         cells = model.cells[:, here.pixels[:, 0]].toarray()
         return cls(model, here, shifted, cells, near, least, sphere, model.chip.um_per_px, stated, moved)
 
-    def at(self, registration: Floats) -> Observed:
-        """The observations moved by a registration (4,): offset x and y in px, scale, angle in rad."""
+    def moved_by(self, registration: Floats) -> Floats:
+        """(n, 2) px by which a registration (4,) moves the observations: offset x and y in px, scale, angle in rad."""
         away = self.away
-        moved = np.asarray(registration[:2] - registration[2] * away - registration[3] * _quarter_turn(away))
+        return np.asarray(registration[:2] - registration[2] * away - registration[3] * _quarter_turn(away))
+
+    def at(self, moved: Floats) -> Observed:
+        """The observations (n, 2) px from where the stated registration puts them."""
         return replace(Observed.of(self.model, self.stated, moved), usual=self.usual, wall_mode=self.wall_mode)
 
     @property

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy  # its linalg and optimize load at first use, not at start-up
@@ -25,10 +26,11 @@ import scipy  # its linalg and optimize load at first use, not at start-up
 from flowrec.core import Floats
 
 POINTS = 32  # at which the posterior of the sizes is integrated; a power of two above the number of sizes
+RANGE = (-6.0, 4.0)  # of a ln size, in standard deviations of its hyperprior
 NEGLIGIBLE = 1e-3  # weight of a point, relative to the largest, that is left out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots, for the cached matrix
 class Effect:
     """One kind of unknown, or of error, and the hyperprior of its size."""
 
@@ -38,7 +40,7 @@ class Effect:
     columns: Floats  # (unknowns, m) what a unit of each unknown does to the observations; (0, m) for a kernel
     kernel: Floats | None = None  # (m, m) of what no unknown stands for, in addition
 
-    @property
+    @cached_property
     def matrix(self) -> Floats:
         """(m, m) covariance that it adds at size 1."""
         return np.asarray(self.columns.T @ self.columns + (0.0 if self.kernel is None else self.kernel))
@@ -79,17 +81,17 @@ class EffectModel:
         medians = np.log([effect.median for effect in self.effects])
         stds = np.array([effect.ln_std for effect in self.effects])
 
-        def cost(ln_sizes: Floats) -> tuple[float, Floats]:
-            value, gradient = self._likelihood(matrices, ln_sizes)
-            scaled = (ln_sizes - medians) / stds
-            return -value + 0.5 * float(scaled @ scaled), -gradient + scaled / stds
+        # In standard deviations of the hyperprior, because these differ by a factor of 65.
+        def cost(scaled: Floats) -> tuple[float, Floats]:
+            value, gradient = self._likelihood(matrices, medians + stds * scaled)
+            return -value + 0.5 * float(scaled @ scaled), scaled - stds * gradient
 
-        bounds = [(median - 6.0 * std, median + 4.0 * std) for median, std in zip(medians, stds, strict=True)]
-        begin = medians if start is None else start
+        begin = np.zeros(len(stds)) if start is None else np.clip((start - medians) / stds, *RANGE)
+        options = {"maxiter": 40, "ftol": 1e-5}
         found = scipy.optimize.minimize(
-            cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40, "ftol": 1e-5}
+            cost, begin, jac=True, method="L-BFGS-B", bounds=[RANGE] * len(stds), options=options
         )
-        mode = np.asarray(found.x, np.float64)
+        mode = np.asarray(medians + stds * found.x, np.float64)
         inverse = np.linalg.inv(self._covariance(matrices, mode))
         scaled = 2.0 * np.exp(2.0 * mode)[:, None, None] * (inverse @ matrices)
         # Half of the traces of the products of each two.
@@ -110,7 +112,7 @@ class EffectModel:
         normal = _points(len(medians))
         root = np.linalg.cholesky(sizes.covariance)
         points = sizes.mode + normal @ root.T
-        points = np.clip(points, medians - 6.0 * stds, medians + 4.0 * stds)
+        points = np.clip(points, medians + RANGE[0] * stds, medians + RANGE[1] * stds)
         ln_weight = np.empty(len(points))
         for index, point in enumerate(points):
             factor, solved = self._factorise(matrices, point)
@@ -165,14 +167,21 @@ class EffectModel:
         return np.asarray(self.noise + sum_of_effects.reshape(self.noise.shape))
 
     def _factorise(self, matrices: Floats, ln_sizes: Floats) -> tuple[Floats, Floats]:
-        """Cholesky factor (m, m) of the covariance, and the covariance's inverse times y."""
-        factor = scipy.linalg.cholesky(self._covariance(matrices, ln_sizes), lower=True, check_finite=False)
-        return factor, scipy.linalg.cho_solve((factor, True), self.y, check_finite=False)
+        """Cholesky factor (m, m) of the covariance, and the covariance's inverse times y.
+
+        LAPACK's routines are called as they are: the checks of scipy.linalg take as long as a factor of 100 x 100.
+        """
+        factor, failed = scipy.linalg.lapack.dpotrf(self._covariance(matrices, ln_sizes), lower=1, clean=1)
+        if failed:
+            raise np.linalg.LinAlgError(f"the covariance of the observations is not positive definite ({failed})")
+        return factor, scipy.linalg.lapack.dpotrs(factor, self.y, lower=1)[0]
 
     def _likelihood(self, matrices: Floats, ln_sizes: Floats) -> tuple[float, Floats]:
         """Ln N(y; 0, C) and its gradient (effects,) by ln size."""
         factor, solved = self._factorise(matrices, ln_sizes)
-        inverse = scipy.linalg.cho_solve((factor, True), np.eye(len(self.y)), check_finite=False)
+        lower, _ = scipy.linalg.lapack.dpotri(factor, lower=1)
+        # Of the symmetric inverse one triangle is computed; all that follows is a sum over both.
+        inverse = 2.0 * np.tril(lower, -1) + np.diag(np.diag(lower))
         value = -0.5 * float(self.y @ solved) - float(np.log(np.diag(factor)).sum())
         # s^2 (u^T G u - trace(C^-1 G)) with u = C^-1 y, of all effects at once.
         gradient = np.exp(2.0 * ln_sizes) * (

@@ -39,7 +39,6 @@ DOUBTED = (
     ("curved", CURVED[0], 3.0),
     ("noise", 1.0, 1.2),
 )
-GROWTH = 2.0  # of a step over the last one from which on the iteration for the nonlinear remainder diverges
 FAR_PX = 0.5  # by which an observation is moved at least: over less, the flow is linear
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
 NOISIER = 1.3  # noise over the stated one from which on a shaking stage is tried
@@ -257,7 +256,8 @@ def begin(observed: Observed, robust: Robust, steps: Steps) -> State:
     line_hz = None
     if doubtful(evidence, sizes):
         # In the middle of a channel the flow has no gradient, so a few pixels to the side are not found from there.
-        others = [_register_and_fit(observed.at(np.array(start)), robust, sizes.mode) for start in REGISTRATIONS]
+        moved = [observed.at(observed.moved_by(np.array(start))) for start in REGISTRATIONS]
+        others = [_register_and_fit(other, robust, sizes.mode) for other in moved]
         best = max(others, key=lambda entry: entry[2].evidence)
         if best[2].evidence > sizes.evidence:
             observed, evidence, sizes = best
@@ -318,8 +318,8 @@ def _register(observed: Observed, z: Floats, evidence: EffectModel) -> Observed 
     """The observations where the most probable registration has them; None where they are near that already."""
     effects = evidence.effects
     owner = np.repeat([effect.name for effect in effects], [len(effect.columns) for effect in effects])
-    there = observed.at(np.concatenate([z[owner == name] for name in ("offset", "scale", "angle")]))
-    return there if float(np.abs(there.moved - observed.moved).max()) > FAR_PX else None
+    moved = observed.moved_by(np.concatenate([z[owner == name] for name in ("offset", "scale", "angle")]))
+    return observed.at(moved) if float(np.abs(moved - observed.moved).max()) > FAR_PX else None
 
 
 def _iterate_remainder(observed: Observed, robust: Robust, state: State, steps: Steps) -> State:
@@ -328,7 +328,7 @@ def _iterate_remainder(observed: Observed, robust: Robust, state: State, steps: 
     for _ in range(steps.most):
         z = state.evidence.most_probable(state.sizes)
         remainder = model.expansion.approach(model.prior.offset(z[: len(model.known)]), state.remainder)
-        if not remainder.step < GROWTH * last:  # inertia for which frozen factors are too far off
+        if not remainder.step < last:  # inertia for which frozen factors are too far off
             break
         last = remainder.step
         nonlinear = model.expansion.pixels(remainder.flux)

@@ -39,9 +39,17 @@ class SphereBetweenWalls:
         A channel is as wide as the largest disc in it that holds the point: the local thickness of Hildebrand and
         Rueegsegger (1997). `clearance_px` (h, w) is the distance of pixels to the nearest wall.
         """
-        rows, columns = np.nonzero(mask)
-        radii = np.maximum(clearance_px[mask], 0.5)
-        width = [2.0 * radii[(columns - x) ** 2 + (rows - y) ** 2 <= radii**2].max(initial=0.5) for x, y in points]
+        radii = np.where(mask, np.maximum(clearance_px, 0.5), 0.0)
+        square, reach = radii**2, int(np.ceil(radii.max(initial=0.0)))
+        width = []
+        for x, y in points:
+            # No disc whose centre is farther away holds the point.
+            rows = slice(max(int(y) - reach, 0), int(y) + reach + 2)
+            columns = slice(max(int(x) - reach, 0), int(x) + reach + 2)
+            inside = square[rows, columns]
+            away_y = (np.arange(rows.start, rows.start + inside.shape[0]) - y) ** 2
+            away_x = (np.arange(columns.start, columns.start + inside.shape[1]) - x) ** 2
+            width.append(2.0 * radii[rows, columns][away_y[:, None] + away_x <= inside].max(initial=0.5))
         near = np.maximum(near, radius_px)
         return cls(radius_px, near, np.maximum(np.array(width) - near, near))
 

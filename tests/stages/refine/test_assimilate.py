@@ -314,6 +314,6 @@ def test_less_what_the_registration_does_the_observations_lie_on_the_flow(twin):
 
 
 def test_a_fit_whose_inertia_frozen_factors_can_not_follow_keeps_the_last_step_that_shrank(twin):
-    case = twin(noise=0.01, scale=4000.0, assumed=(60.0, 0.0, 0.0))  # Re of 270, from half of it
+    case = twin(noise=0.01, scale=2500.0, assumed=(30.0, 0.0, 0.0))  # Re of 170, from a quarter of it
     refined = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
-    assert case.error(refined) < 0.2 * case.error(case.assumed)
+    assert case.error(refined) < 0.5 * case.error(case.assumed)
