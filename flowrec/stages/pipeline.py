@@ -5,6 +5,7 @@ The previous Tick is all the state between ticks, so the pipeline can resume at 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
@@ -175,6 +176,12 @@ def _place_on_chip(estimate: Estimate, refined: FlowField | None) -> Estimate:
     return replace(estimate, position_um=on_chip(refined.registration, estimate.position_um))
 
 
+@functools.lru_cache(maxsize=2)
+def _without_registration(flow: FlowField) -> FlowField:
+    """A map for an observer that reads it where the image shows the robot, whatever a refinement found."""
+    return flow if flow.registration is None else replace(flow, registration=None)
+
+
 def _strength(coils: Coils, last: Tick) -> float:
     """Amplitude of the field in the tick before, relative to the full one; 1 before the first."""
     full_mt = coils.amplitude_mt
@@ -300,8 +307,10 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     track, appearance = sight.track, sight.appearance
     assert track is not None, "the tracker says of every image whether it shows the robot"
     lap("track")
-    known = p.robot.learned_from(tick.refined) if p.refiner.correct_robot else p.robot
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, known, flow, last.health)
+    known, seen = p.robot, None if flow is None else _without_registration(flow)
+    if p.refiner.correct_robot:
+        known, seen = p.robot.learned_from(tick.refined), flow
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, known, seen, last.health)
     # The robot with the estimated um_per_rev, if the observer estimates it.
     robot = known if estimate.um_per_rev is None else replace(known, um_per_rev=estimate.um_per_rev)
     # Sessions recorded before step-out was monitored replay without it.
@@ -311,7 +320,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     wall_um = _wall_um(p, placed.position_um)
     health = last.health
     if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
-        health = p.health.watch(health, last.estimate, estimate, flow, known, looked, wall_um)
+        health = p.health.watch(health, last.estimate, estimate, seen, known, looked, wall_um)
     robot = robot.limited_to(health.limit_hz)
     mapless, measured = last.mapless, estimate
     if p.sampler.without_map:

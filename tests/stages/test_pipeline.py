@@ -9,6 +9,7 @@ import pytest
 
 import flowrec
 from flowrec.core.enums import Outcome, Phase
+from flowrec.physics import sample
 from flowrec.stages.pipeline import Inputs, assemble, step
 
 
@@ -67,3 +68,24 @@ def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no
     assert flown(-0.02, std=0.02).estimate.same_as(plain.estimate), "no more than its error"
     stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_robot=False))
     assert flown(-0.2, pipeline=stated).estimate.same_as(plain.estimate)
+
+
+def test_an_observer_that_corrects_the_map_reads_it_where_the_registration_puts_the_robot(session):
+    recorded = flowrec.open(session)
+    ticks = [tick for tick in recorded.ticks() if tick.mission and tick.mission.phase == Phase.NAVIGATE]
+    pipeline = assemble(recorded.config, recorded.chip)
+    pipeline = replace(pipeline, observer=replace(pipeline.observer, method="kalman_map"))
+    across = np.column_stack((np.eye(2), [0.0, 80.0]))  # to a place of another speed
+
+    def flow_um_s(registration, correct_robot):
+        refiner = replace(pipeline.refiner, correct_robot=correct_robot)
+        last = replace(ticks[3], refined=replace(ticks[3].field, registration=registration), estimate=None)
+        now = ticks[4]
+        inputs = Inputs(now.stamp_ns, now.frame, now.applied)
+        return step(replace(pipeline, refiner=refiner), last, inputs).estimate
+
+    there, stated = flow_um_s(across, True), flow_um_s(None, True)
+    expected = sample(ticks[3].field, there.position_um + np.array([0.0, 80.0]))
+    assert np.allclose(there.flow_um_s, expected, atol=1.0)
+    assert np.hypot(*(there.flow_um_s - stated.flow_um_s)) > 20.0
+    assert flow_um_s(across, False).same_as(stated)

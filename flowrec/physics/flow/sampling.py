@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.core import Bools, Floats, FlowError, FlowField
+from flowrec.physics.chip.registration import on_chip
 from flowrec.physics.flow.velocity_stencil import velocities_at, velocity_at
 
 _NO_WALLS = np.zeros((0, 0), np.float32)
@@ -30,6 +31,16 @@ def sample(field: FlowField, points_um: ArrayLike) -> Floats:
     h, w = velocity.shape[:2]
     inside = -0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5
     return np.array(velocity_at(velocity, wall_px, x, y) if inside else (0.0, 0.0))
+
+
+def sample_as_seen(field: FlowField, points_um: ArrayLike) -> Floats:
+    """`sample` at points (..., 2) as the image shows them, in its um/s, by the registration that a refinement found."""
+    if field.registration is None:
+        return sample(field, points_um)
+    velocity = sample(field, on_chip(field.registration, points_um))
+    (xx, xy, _), (yx, yy, _) = field.registration
+    x, y = velocity[..., 0], velocity[..., 1]
+    return np.asarray(np.stack((yy * x - xy * y, xx * y - yx * x), -1) / (xx * yy - xy * yx))
 
 
 def walls_of(field: FlowField) -> NDArray[np.float32]:

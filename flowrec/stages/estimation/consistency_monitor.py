@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import Alarm, Applied, Estimate, Floats, FlowField, Health, Range, Share, seconds
-from flowrec.physics import Robot, sample
+from flowrec.physics import Robot, sample_as_seen
 from flowrec.stages.estimation.step_out import StepOut
 
 Resonators = NDArray[np.complex128]
@@ -92,7 +92,8 @@ class HealthMonitor:
         if estimate.seen and dt > 0.0 and variance < (self.settled_share * robot.max_speed_um_s) ** 2:
             settled_s += dt
             mean = mean + weight * (estimate.flow_um_s - mean)
-            deviation = _flow_deviation(estimate, mean if field is None else sample(field, estimate.position_um), robot)
+            expected = mean if field is None else sample_as_seen(field, estimate.position_um)
+            deviation = _flow_deviation(estimate, expected, robot)
             offset += weight * (deviation - offset)
             z, power = self._resonate(z, power, deviation - offset, dt, seconds(estimate.stamp_ns))
         strongest = int(np.argmax(np.abs(z)))

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from flowrec.core import Applied, Estimate, Floats, FlowField, Range, Share, Track, seconds
-from flowrec.physics import OBSERVER, Robot, sample
+from flowrec.physics import OBSERVER, Robot, sample_as_seen
 from flowrec.stages.estimation.process_model import (
     ISOTROPIC,
     StateLayout,
@@ -137,7 +137,7 @@ class Kalman:
             if np.isfinite(track.position_um).all():
                 state[:2] = track.position_um
             if field is not None:
-                state[2:4] = sample(field, state[:2])
+                state[2:4] = sample_as_seen(field, state[:2])
             return state, covariance, layout, np.eye(layout.size)
         state, covariance = state_of(previous, layout, robot)
         dt = max(seconds(track.stamp_ns - previous.stamp_ns), 0.0)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowrec.core import Floats, FlowField
-from flowrec.physics import sample
+from flowrec.physics import sample_as_seen
 
 ISOTROPIC = np.array([0.5, 1.0, 1.0])  # relative variances of [sxx, sxy, syx] that do not depend on the axes
 
@@ -59,10 +59,10 @@ def propagate(
     gradient = np.zeros((2, 2))
     ahead = state.copy()
     if field is not None:
-        here = sample(field, position)
-        middle = flow + sample(field, position + 0.5 * displacement) - here
+        here = sample_as_seen(field, position)
+        middle = flow + sample_as_seen(field, position + 0.5 * displacement) - here
         ahead[:2] = position + moved + dt * middle
-        ahead[2:4] = flow + sample(field, ahead[:2]) - here
+        ahead[2:4] = flow + sample_as_seen(field, ahead[:2]) - here
         gradient = gradient_at(field, ahead[:2])
     else:
         if layout.gradient and not constant_flow:
@@ -106,6 +106,6 @@ def process_noise(layout: StateLayout, dt: float, flow: float, gradient: float, 
 def gradient_at(field: FlowField, point_um: Floats) -> Floats:
     """(2, 2) 1/s: dv_i/dx_j of a map, central differences over one of its pixels."""
     right, down = np.array([[0.5, 0.0], [0.0, 0.5]]) * field.um_per_px
-    by_x = sample(field, point_um + right) - sample(field, point_um - right)
-    by_y = sample(field, point_um + down) - sample(field, point_um - down)
+    by_x = sample_as_seen(field, point_um + right) - sample_as_seen(field, point_um - right)
+    by_y = sample_as_seen(field, point_um + down) - sample_as_seen(field, point_um - down)
     return np.column_stack((by_x, by_y)) / field.um_per_px

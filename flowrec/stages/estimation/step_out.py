@@ -20,7 +20,7 @@ from typing import Annotated
 import numpy as np
 
 from flowrec.core import Applied, Estimate, FlowField, Health, PositiveShare, Range, Share, seconds
-from flowrec.physics import STEP_OUT, Robot, sample
+from flowrec.physics import STEP_OUT, Robot, sample_as_seen
 
 _NONE = np.zeros(0)
 _SETTLED = 0.6  # fraction of the window's weight that must be present
@@ -93,7 +93,7 @@ class StepOut:
         if self.learned and turns < _FULL * limit_hz * dt:
             return now
         heading = applied.turns / turns
-        carried = dt * sample(field, 0.5 * (before.measured_um + estimate.measured_um))
+        carried = dt * sample_as_seen(field, 0.5 * (before.measured_um + estimate.measured_um))
         rolled_um = float((estimate.measured_um - before.measured_um - carried) @ heading)
         newest = np.array([rolled_um, robot.um_per_rev * turns, math.hypot(*carried), dt])
         window_s = self._window_s(robot, dt)

@@ -106,7 +106,8 @@ class Refiner:
     observes_flow: bool = True
     # Mission and controller place the robot on the chip by the registration that the refinement found.
     place_robot: bool = True
-    # Observer, health and controller take the um per revolution that the refinement found.
+    # Observer, health and controller take the um per revolution that the refinement found, and read the map where its
+    # registration puts the robot.
     correct_robot: bool = True
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)

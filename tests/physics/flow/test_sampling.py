@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flowrec.core.messages import FlowField
-from flowrec.physics.flow.sampling import sample
+from flowrec.physics.chip.registration import on_chip
+from flowrec.physics.flow.sampling import sample, sample_as_seen
 
 
 @pytest.fixture
@@ -31,3 +34,12 @@ def test_the_border_holds_for_half_a_pixel_and_there_is_nothing_beyond(bilinear)
     assert sample(bilinear, [66.0, 46.0]) == pytest.approx(sample(bilinear, [64.0, 44.0]))
     for outside in ([-2.1, 3.0], [3.0, 46.1], [np.nan, 3.0]):
         assert not sample(bilinear, outside).any() and not sample(bilinear, [outside]).any()
+
+
+def test_a_flow_as_the_image_shows_it_moves_a_point_of_the_image_as_the_flow_moves_its_place_on_the_chip(bilinear):
+    registration = np.array([[1.02, -0.05, 3.1], [0.06, 0.97, -1.2]])  # offset, scale and turn
+    field, seen = replace(bilinear, registration=registration), np.array([[15.0, 12.0], [26.0, 20.0]])
+    moved = on_chip(registration, seen + 1e-3 * sample_as_seen(field, seen)) - on_chip(registration, seen)
+    assert moved / 1e-3 == pytest.approx(sample(bilinear, on_chip(registration, seen)), rel=1e-6)
+    assert np.array_equal(sample_as_seen(bilinear, seen), sample(bilinear, seen)), "without a registration"
+    assert sample_as_seen(field, seen[0]) == pytest.approx(sample_as_seen(field, seen)[0])
