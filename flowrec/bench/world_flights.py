@@ -225,7 +225,7 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
 
 
 def _refine_order(order: Tick, pipeline: Pipeline, config: ResolvedConfig, chip: Chip, method: str) -> FlowField:
-    """What a refiner or a null model gives for a work order, good or bad."""
+    """The field that a refiner or a null model gives for a work order, good or bad."""
     if method in NULL_MODELS:
         assert order.assumed is not None and order.observations is not None
         return NullModel(method).refine(order.assumed, order.observations, chip, pipeline.solver)
