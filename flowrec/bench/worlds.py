@@ -233,8 +233,8 @@ def show(results: Results) -> None:
         "stated: over the true error; CRPS in % of the speed",
         lines,
         {
-            **{"world": "{world}", "method": "{method}", "assumed": "{before}", "refined": "{after}"},
-            **{"95 %": "{interval}", f"/ {NULL}": "{ratio}", "worse": "{worse}", "unsaid": "{unsaid}"},
+            **{"world": "{world}", "method": "{method}", "error": "{after}"},
+            **{"95 %": "{interval}", "worse": "{worse}", "unsaid": "{unsaid}"},
             **{"named": "{warned}", "invented": "{invented}"},
             **{"2 sigma": "{covered}", "stated": "{stated}", "CRPS": "{score}"},
         },
@@ -256,16 +256,15 @@ def _line(world: str, method: str, found: Results) -> Results:
     def percent(share: float | None, digits: int = 1) -> str:
         return "-" if share is None or not math.isfinite(share) else f"{100 * share:.{digits}f}"
 
-    ratio = found["over_null"]
     low, high = found["error"]["interval_95"]
     return {
         **{"world": world, "method": method, "worse": found["worse"], "unsaid": found["unsaid"]},
         **{"warned": found["warned"], "invented": found["invented"]},
-        **{"before": percent(found["assumed"]["mean"]), "after": percent(found["error"]["mean"])},
+        "after": percent(found["error"]["mean"]),
         **{
             "interval": f"{percent(low)}-{percent(high)}" if found["count"] else "-",
             "score": percent(found["crps"]["mean"]),
         },
         "stated": f"{found['stated_over_true']:.2f}" if found["stated_over_true"] else "-",
-        **{"covered": percent(found["within_2_sigma"], 0), "ratio": f"{ratio['mean']:.2f}" if ratio else "-"},
+        "covered": percent(found["within_2_sigma"], 0),
     }
