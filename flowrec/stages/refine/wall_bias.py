@@ -76,6 +76,12 @@ def wall_bias_px(state: State) -> float:
     return float(state.evidence.most_probable(state.sizes)[first])
 
 
+def _with_fewer_outliers(usual: Robust, observed: Observed) -> Robust:
+    """Noise in other walls: what was an outlier may be explained there, but what was none does not become one."""
+    noise = robust_noise(observed)
+    return noise if noise.inlier.sum() >= usual.inlier.sum() else usual
+
+
 def in_biased_walls(
     chip: Chip,
     solver: FlowSolver,
@@ -97,7 +103,7 @@ def in_biased_walls(
     for offset_px in OFFSETS_PX:
         with suppress(FlowError):  # channels that are closed
             observed = observe(with_wall_offset(chip, offset_px), solver=coarse)
-            noise = robust_noise(observed)  # what was an outlier may be explained now
+            noise = _with_fewer_outliers(robust, observed)
             seen[offset_px] = first_evidence(observed, noise) - outlying(noise)
     best: tuple[Robust, State] | None = None
     offset_px, tried = max(seen, key=seen.__getitem__), set[float]()
@@ -109,7 +115,7 @@ def in_biased_walls(
         except FlowError:
             break
         observed = replace(observed, wall_mode=wall_mode(moved, solver))
-        noise = robust_noise(observed)
+        noise = _with_fewer_outliers(robust, observed)
         state = begin(observed, noise, steps)
         if best and state.sizes.evidence - outlying(noise) <= best[1].sizes.evidence - outlying(best[0]):
             break

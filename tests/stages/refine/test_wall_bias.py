@@ -78,3 +78,13 @@ def test_a_threshold_that_is_off_by_a_fraction_of_a_pixel_is_found_with_the_flow
     flow = sample(drawn, places) + 2.0 * np.random.default_rng(2).standard_normal(places.shape)
     same = Refiner().refine(drawn, replace(Observations(0, places, flow, std)), chip, solver)
     assert "mask" not in same.note
+
+
+def test_walls_off_everywhere_do_not_explain_a_closed_branch_by_calling_its_observations_outliers(twin):
+    case = twin(noise=0.02, every=2)
+    mask = case.chip.mask.copy()
+    mask[8:13, 30:50] = False  # debris closes most of the upper branch
+    flow = sample(case.solver.solve(replace(case.chip, mask=mask)), case.observations.position_um)
+    seen = replace(case.observations, flow_um_s=flow)
+    refined = Refiner().refine(case.assumed, seen, case.chip, case.solver)
+    assert "the mask" not in refined.note and "outliers" not in refined.note
