@@ -6,7 +6,6 @@ own, so that peak memory is that of the method.
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -19,7 +18,17 @@ import numpy as np
 import typer
 
 from flowrec.bench.figure_flow import FlowPanels, draw, median_case
-from flowrec.bench.harness import Cases, FigureFile, Names, Results, choose_names, flow_scores, print_rows, vessel_cases
+from flowrec.bench.harness import (
+    Cases,
+    FigureFile,
+    Names,
+    Results,
+    choose_names,
+    flow_scores,
+    print_rows,
+    stated_over_true,
+    vessel_cases,
+)
 from flowrec.bench.null_models import NULL_MODELS, NullModel
 from flowrec.bench.vessel_truth import read_observations, read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
@@ -192,28 +201,20 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Mean, standard deviation and median over cases; `mean` and `std` are those of rmse_v.
-
-    `stated_over_true` is the root mean square of the stated errors over that of the errors.
-    """
+    """Mean, standard deviation and median over cases; `mean` and `std` are those of rmse_v."""
     of = {key: [row[key] for row in rows] for key in rows[0]}
     moments: dict[str, float | None] = {}
     for name in ("rmse_vx", "rmse_vy", "rmse_v"):
         moments |= {f"{name}_mean": float(np.mean(of[name])), f"{name}_std": float(np.std(of[name]))}
-    stated = [
-        (error, within, ratio)
-        for error, within, ratio in zip(of["rmse_v"], of["within_2_std"], of["stated_over_true"], strict=True)
-        if ratio is not None
-    ]
-    errors, covered, ratios = np.array(stated).reshape(-1, 3).T
+    covered = [value for value in of["within_2_std"] if value is not None]
     return moments | {
         "mean": moments["rmse_v_mean"],
         "std": moments["rmse_v_std"],
         "worst": max(of["rmse_v"]),
         **{f"median_{name}": float(np.median(of[name])) for name in ("seconds", "cpu_seconds", "seconds_update")},
         "peak_mb": max(of["peak_mb"]),
-        "within_2_std": float(covered.mean()) if stated else None,
-        "stated_over_true": math.hypot(*(errors * ratios)) / math.hypot(*errors) if stated else None,
+        "within_2_std": float(np.mean(covered)) if covered else None,
+        "stated_over_true": stated_over_true(zip(of["rmse_v"], of["stated_over_true"], strict=True)),
         "crps": float(np.mean(of["crps"])),
     }
 

@@ -189,6 +189,12 @@ def flow_scores(found: FlowField, truth: NDArray[np.floating], mask: NDArray[np.
     }
 
 
+def stated_over_true(rows: Iterable[tuple[float, float | None]]) -> float | None:
+    """Root mean square of stated errors over that of the errors, of fields (error, stated over true); None: of none."""
+    true, stated = np.array([(error, error * ratio) for error, ratio in rows if ratio is not None]).reshape(-1, 2).T
+    return math.hypot(*stated) / max(math.hypot(*true), 1e-300) if len(true) else None
+
+
 def wilson(successes: int, count: int) -> tuple[float, float]:
     """The 95 % score interval of a proportion; (0, 1) without a trial. Source: Wilson (1927)."""
     if count == 0:

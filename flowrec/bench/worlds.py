@@ -20,7 +20,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, choose_names, mean_with_interval, paired_ratio, print_rows
+from flowrec.bench.harness import Results, choose_names, mean_with_interval, paired_ratio, print_rows, stated_over_true
 from flowrec.bench.null_models import NULL_MODELS
 from flowrec.bench.world_flights import WORLDS, Flight, FlightCase, as_line, fly, refine
 from flowrec.core import UsageError, append_line, pool, progress, provenance, replace_content, say
@@ -197,20 +197,13 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
         "expected": mean_with_interval(expected),
         "crps": mean_with_interval([one["crps"] for one in mine]),
         "within_2_sigma": float(np.mean(stated)) if stated else None,
-        "stated_over_true": _stated_over_true(mine),
+        "stated_over_true": stated_over_true((one["error"], one.get("stated_over_true")) for one in mine),
         "worse": len(worse),
         "unsaid": sum(not one["warned"] for one in worse),
         "warned": sum(one["warned"] for one in mine),
         "invented": sum(one.get("invented", 0) > 0 for one in mine),
         "over_null": paired_ratio(np.array(pairs)) if pairs and method != NULL else None,
     }
-
-
-def _stated_over_true(mine: Sequence[Results]) -> float | None:
-    """Root mean square of the stated errors over that of the errors; None where a flight states none."""
-    pairs = [(one["error"], one["error"] * one["stated_over_true"]) for one in mine if one.get("stated_over_true")]
-    true, stated = np.array(pairs).reshape(-1, 2).T
-    return math.hypot(*stated) / math.hypot(*true) if pairs else None
 
 
 def show(results: Results) -> None:

@@ -8,7 +8,6 @@ from typing import Annotated
 
 from flowrec.core import FlowField, PositiveShare, Range
 
-UM_PER_REV = "um_per_rev_share"  # of FlowField.parameter_names: the true one over the stated one, less 1
 _SIGNIFICANT = 2.0  # standard deviations
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
 
@@ -60,11 +59,10 @@ class Robot(RobotSettings):
 
         A robot that moves less per revolution is slower, one that moves more is not commanded to swim faster.
         """
-        names = [] if refined is None else refined.parameter_names.split("; ")
-        if refined is None or UM_PER_REV not in names:
+        found = None if refined is None else refined.parameter("um_per_rev_share")
+        if found is None:
             return self
-        index = names.index(UM_PER_REV)
-        change, std = float(refined.parameters[index]), float(refined.parameter_std[index])
+        change, std = found  # of the true um per revolution over the stated one, less 1
         if abs(change) <= _SIGNIFICANT * std or change <= -1.0:
             return self
         slower = min(1.0 + change, 1.0)

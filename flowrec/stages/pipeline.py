@@ -307,9 +307,10 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     track, appearance = sight.track, sight.appearance
     assert track is not None, "the tracker says of every image whether it shows the robot"
     lap("track")
-    known, seen = p.robot, None if flow is None else _without_registration(flow)
     if p.refiner.correct_robot:
         known, seen = p.robot.learned_from(tick.refined), flow
+    else:
+        known, seen = p.robot, None if flow is None else _without_registration(flow)
     estimate = p.observer.estimate(last.estimate, track, inputs.applied, known, seen, last.health)
     # The robot with the estimated um_per_rev, if the observer estimates it.
     robot = known if estimate.um_per_rev is None else replace(known, um_per_rev=estimate.um_per_rev)

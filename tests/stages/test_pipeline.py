@@ -13,17 +13,30 @@ from flowrec.physics import sample
 from flowrec.stages.pipeline import Inputs, assemble, step
 
 
-def test_mission_and_controller_place_the_robot_by_the_registration_that_was_found_and_observations_keep_the_stated(
-    session,
-):
+@pytest.fixture(scope="module")
+def navigation(session):
+    """The stages of a recorded mission, and its ticks on the way to the goal."""
     recorded = flowrec.open(session)
     ticks = [tick for tick in recorded.ticks() if tick.mission and tick.mission.phase == Phase.NAVIGATE]
-    last, now = ticks[3:5]
-    pipeline = assemble(recorded.config, recorded.chip)
+    return assemble(recorded.config, recorded.chip), ticks
+
+
+def after(pipeline, last, ticks):
+    """The tick after `last` and the images and applied fields of recorded ticks."""
+    for now in ticks:
+        last = step(pipeline, last, Inputs(now.stamp_ns, now.frame, now.applied))
+    return last
+
+
+def test_mission_and_controller_place_the_robot_by_the_registration_that_was_found_and_observations_keep_the_stated(
+    navigation,
+):
+    pipeline, ticks = navigation
+    last = ticks[3]
 
     def stepped(registration):
         refined = replace(last.field, registration=registration)
-        return step(pipeline, replace(last, refined=refined), Inputs(now.stamp_ns, now.frame, now.applied))
+        return after(pipeline, replace(last, refined=refined), ticks[4:5])
 
     plain = stepped(None)
     assert not plain.mission.finished
@@ -40,19 +53,14 @@ def test_mission_and_controller_place_the_robot_by_the_registration_that_was_fou
     assert moved.demand.velocity_um_s[1] < plain.demand.velocity_um_s[1]  # back to the route
 
 
-def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no_observation(session):
-    recorded = flowrec.open(session)
-    ticks = [tick for tick in recorded.ticks() if tick.mission and tick.mission.phase == Phase.NAVIGATE]
-    pipeline = assemble(recorded.config, recorded.chip)
+def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no_observation(navigation):
+    pipeline, ticks = navigation
 
     def flown(change, std=0.01, pipeline=pipeline):
         """The mission from a tick on, over some frames, with a map that found that much of the robot."""
         found = replace(ticks[3].field, parameter_names="depth_um; um_per_rev_share")
         found = replace(found, parameters=np.array([90.0, change]), parameter_std=np.array([9.0, std]))
-        last = replace(ticks[3], refined=found)
-        for now in ticks[4:30]:
-            last = step(pipeline, last, Inputs(now.stamp_ns, now.frame, now.applied))
-        return last
+        return after(pipeline, replace(ticks[3], refined=found), ticks[4:30])
 
     plain, corrected = flown(0.0), flown(-0.2)
     # A robot that rolls less is carried more along its course: the motion that was seen is the sum of both.
@@ -70,19 +78,15 @@ def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no
     assert flown(-0.2, pipeline=stated).estimate.same_as(plain.estimate)
 
 
-def test_an_observer_that_corrects_the_map_reads_it_where_the_registration_puts_the_robot(session):
-    recorded = flowrec.open(session)
-    ticks = [tick for tick in recorded.ticks() if tick.mission and tick.mission.phase == Phase.NAVIGATE]
-    pipeline = assemble(recorded.config, recorded.chip)
+def test_an_observer_that_corrects_the_map_reads_it_where_the_registration_puts_the_robot(navigation):
+    pipeline, ticks = navigation
     pipeline = replace(pipeline, observer=replace(pipeline.observer, method="kalman_map"))
     across = np.column_stack((np.eye(2), [0.0, 80.0]))  # to a place of another speed
 
     def flow_um_s(registration, correct_robot):
         refiner = replace(pipeline.refiner, correct_robot=correct_robot)
         last = replace(ticks[3], refined=replace(ticks[3].field, registration=registration), estimate=None)
-        now = ticks[4]
-        inputs = Inputs(now.stamp_ns, now.frame, now.applied)
-        return step(replace(pipeline, refiner=refiner), last, inputs).estimate
+        return after(replace(pipeline, refiner=refiner), last, ticks[4:5]).estimate
 
     there, stated = flow_um_s(across, True), flow_um_s(None, True)
     expected = sample(ticks[3].field, there.position_um + np.array([0.0, 80.0]))

@@ -105,6 +105,14 @@ class FlowField(Message):
     log_score_before: float | None = None
     log_score_error: float | None = None
 
+    def parameter(self, name: str) -> tuple[float, float] | None:
+        """Value and standard deviation of something that the refinement found; None if it says nothing of it."""
+        names = self.parameter_names.split("; ")
+        if name not in names:
+            return None
+        index = names.index(name)
+        return float(self.parameters[index]), float(self.parameter_std[index])
+
     def to_xarray(self) -> xarray.Dataset:
         """The field as an xarray Dataset: dimensions y_um, x_um (pixel centres, chip frame, y down) and component.
 

@@ -69,7 +69,7 @@ class Chip:
     # (h, w) friction of each pixel beside that of the depth, as 12 / depth^2: the force is -mu times this times v
     friction_per_um2: Floats | None = None
     law: ViscosityLaw | None = None  # viscosity over viscosity_mpa_s as a function of shear rate; None: Newtonian
-    # (h, w) the mask whose smooth walls, moved outwards by the offset, are those of the chip; None: its own mask's
+    # (h, w) the mask whose walls, moved outwards by the offset, are those of the chip; None: its own mask's
     drawn: Bools | None = None
     wall_offset_px: float = 0.0
 

@@ -255,8 +255,8 @@ def geometry_key(chip: Chip, k: int) -> tuple[Hashable, ...]:
     """All of a chip that the matrices depend on, as part of a cache key."""
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
     mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    moved = (None if chip.drawn is None else np.packbits(chip.drawn).tobytes(), chip.wall_offset_px)
-    return (*mask, *moved, openings, chip.walls, k, depth_friction(chip, k), array_key(chip.friction_per_um2))
+    walls = (chip.walls, array_key(chip.drawn), chip.wall_offset_px)
+    return (*mask, openings, *walls, k, depth_friction(chip, k), array_key(chip.friction_per_um2))
 
 
 def with_friction(bare: System, friction_per_um2: Floats, um_per_px: float) -> System:

@@ -1,7 +1,7 @@
 """A chip whose walls lie a fraction of a pixel inside or outside those that its mask shows.
 
 A threshold that is too high or too low moves all walls of a segmented mask by the same distance. The walls of such a
-chip are the smooth contour of its mask, moved by that distance; its pixels are those whose centres lie between them.
+chip are those of its mask, moved by that distance (level_set.py); its pixels are those whose centres lie between them.
 """
 
 from __future__ import annotations
@@ -24,15 +24,12 @@ def with_wall_offset(chip: Chip, offset_px: float) -> Chip:
     FlowError
         If an opening closes, or two meet.
     """
-    total_px = chip.wall_offset_px + offset_px
     if offset_px == 0.0:
         return chip
+    total_px = chip.wall_offset_px + offset_px
     drawn = chip.mask if chip.drawn is None else chip.drawn
-    if total_px == 0.0:
-        mask = drawn
-    else:
-        level = from_mask(drawn, 2, chip.walls, total_px).level
-        mask = np.ascontiguousarray(level[2::4, 2::4] >= 0.5 * CLEARANCE_PX)
+    level = from_mask(drawn, 2, chip.walls, total_px).level
+    mask = np.ascontiguousarray(level[2::4, 2::4] >= 0.5 * CLEARANCE_PX)
     runs = [run_around(border(mask, o.side), (o.first + o.last) // 2) for o in chip.openings]
     if None in runs or len({(o.side, run) for o, run in zip(chip.openings, runs, strict=True)}) < len(runs):
         raise FlowError(f"chip '{chip.name}' with walls moved by {total_px:g} px: an opening closes or meets another")

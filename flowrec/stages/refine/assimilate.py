@@ -205,8 +205,9 @@ class Assimilate(PriorSettings):
         if self.doubt_walls and small:
             noise, state, ln_share = begun[1]  # walls that are off by chance only
             observe = partial(self._observe, stated=chip, operator=operator)
-            found_so = in_biased_walls(chip, solver, state, noise, observe, steps)
-            begun += [(*one, ln_share + float(np.log(BIASED_SHARE))) for one in found_so]
+            biased = in_biased_walls(chip, solver, state, noise, observe, steps)
+            if biased is not None:
+                begun.append((*biased, ln_share + float(np.log(BIASED_SHARE))))
 
         def ln_weights(evidence: list[float], which: Sequence[int]) -> tuple[Floats, Floats]:
             """Ln of the posterior probabilities, and of the likelihood ratios to the chip as it is drawn."""

@@ -76,10 +76,10 @@ class Findings:
 
 def scale_doubt(field: FlowField, um_per_px: float) -> str:
     """Reason to doubt a session's stated scale by its refined field; '' if the field has no other scale."""
-    names = field.parameter_names.split("; ")
-    if "um_per_px_share" not in names:
+    scale = field.parameter("um_per_px_share")
+    if scale is None:
         return ""
-    value, std = (float(each[names.index("um_per_px_share")]) for each in (field.parameters, field.parameter_std))
+    value, std = scale
     if abs(value) <= max(OTHER_SCALE, OTHER_SCALE_STDS * std):
         return ""
     way = "large" if value > 0.0 else "small"

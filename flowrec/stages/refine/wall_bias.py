@@ -89,16 +89,15 @@ def in_biased_walls(
     robust: Robust,
     observe: Callable[..., Observed],
     steps: Steps,
-) -> list[tuple[Robust, State]]:
-    """The state of a chip whose walls are all off by the same distance, around that distance; [] where nothing asks.
+) -> tuple[Robust, State] | None:
+    """The state of a chip whose walls are all off by the same distance, around that distance; None: nothing asks.
 
     `usual` and `robust` are those of walls that are off by chance only; `observe(chip=, solver=)` gives the
     observations in other walls.
     """
-    if gain_by_bias(usual, robust, wall_mode(chip, solver)) < WORTH_TRYING and not doubtful(
-        usual.evidence, usual.sizes
-    ):
-        return []
+    doubted = doubtful(usual.evidence, usual.sizes)
+    if not doubted and gain_by_bias(usual, robust, wall_mode(chip, solver)) < WORTH_TRYING:
+        return None
     coarse, seen = replace(solver, k=1), {}
     for offset_px in OFFSETS_PX:
         with suppress(FlowError):  # channels that are closed
@@ -106,7 +105,8 @@ def in_biased_walls(
             noise = _with_fewer_outliers(robust, observed)
             seen[offset_px] = first_evidence(observed, noise) - outlying(noise)
     best: tuple[Robust, State] | None = None
-    offset_px, tried = max(seen, key=seen.__getitem__), set[float]()
+    # Openings can be too narrow for the coarse grid in all of these walls.
+    offset_px, tried = max(seen, key=seen.__getitem__, default=0.0), set[float]()
     while offset_px not in tried:
         tried.add(offset_px)
         try:
@@ -121,4 +121,4 @@ def in_biased_walls(
             break
         best = noise, state
         offset_px = nearest_offset(wall_bias_px(state))
-    return [] if best is None else [best]
+    return best
