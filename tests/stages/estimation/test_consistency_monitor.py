@@ -39,6 +39,18 @@ def test_a_steady_flow_raises_no_alarm(mapped: bool) -> None:
     assert len(encode(health[-1])) < 1300
 
 
+def test_a_map_is_compared_where_its_registration_puts_the_robot() -> None:
+    estimates, field = driven(3.0).observed(KALMAN), vortex(1.1)
+    moved = replace(field, velocity_um_s=np.roll(field.velocity_um_s, 3, axis=1))
+    registration = np.array([[1.0, 0.0, 3.0 * field.um_per_px], [0.0, 1.0, 0.0]])
+    right, placed, beside = (
+        np.array([each.offset_share for each in watched(estimates, each_map)])
+        for each_map in (field, replace(moved, registration=registration), moved)
+    )
+    assert placed == pytest.approx(right, abs=1e-6)
+    assert np.abs(beside - right).max() > 0.01
+
+
 @pytest.mark.parametrize("hertz", [0.1, 0.5, 1.0, 2.0])
 def test_a_pulsating_flow_is_told_within_seconds_with_its_frequency_and_strength(hertz: float) -> None:
     lap = driven(3.0, pulsation=0.5, pulsation_hz=hertz)
