@@ -36,29 +36,33 @@ SIDE_PX = 128
 Mask = NDArray[np.bool_]
 
 
-def photograph(mask: Mask, blur_px: float = 1.0) -> NDArray[np.uint8]:
-    """A picture (h, w) of dark channels: out of focus, lit from one side, with 1 % noise; one mask has one picture."""
+def photograph(mask: Mask, blur_px: float = 1.0, finer: int = 1) -> NDArray[np.uint8]:
+    """A picture (h, w) of dark channels: out of focus, lit from one side, with 1 % noise; one mask has one picture.
+
+    The mask has `finer` pixels per pixel side of the picture.
+    """
     rng = np.random.default_rng(zlib.crc32(mask.tobytes()))
-    fine, beyond = 4, 8  # subpixels, and pixels beyond the border over which channels go on
-    drawn = np.pad(mask, beyond, mode="edge").repeat(fine, axis=0).repeat(fine, axis=1).astype(np.float64)
+    each = 4 if finer == 1 else 1  # subpixels that a pixel of the mask is cut into
+    fine, beyond = each * finer, 8  # subpixels, and pixels beyond the border over which channels go on
+    drawn = np.pad(mask, beyond * finer, mode="edge").repeat(each, axis=0).repeat(each, axis=1).astype(np.float64)
     drawn = gaussian_filter(drawn, fine * blur_px)
-    h, w = (size + 2 * beyond for size in mask.shape)
+    h, w = (size // fine for size in drawn.shape)
     seen = drawn.reshape(h, fine, w, fine).mean(axis=(1, 3))[beyond:-beyond, beyond:-beyond]
-    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]] / max(mask.shape)
+    y, x = np.mgrid[: seen.shape[0], : seen.shape[1]] / max(seen.shape)
     angle = rng.uniform(0.0, 2.0 * np.pi)
     light = (0.65 - 0.3 * seen) * (1.0 + 0.15 * (np.cos(angle) * x + np.sin(angle) * y))
-    return np.asarray(np.clip(255.0 * (light + rng.normal(0.0, 0.01, mask.shape)), 0, 255), np.uint8)
+    return np.asarray(np.clip(255.0 * (light + rng.normal(0.0, 0.01, seen.shape)), 0, 255), np.uint8)
 
 
-def threshold_by_otsu(mask: Mask) -> Mask:
+def threshold_by_otsu(picture: NDArray[np.uint8]) -> Mask:
     """The mask that one threshold for the whole picture gives."""
-    smooth = cv2.GaussianBlur(photograph(mask), (0, 0), 0.7)
+    smooth = cv2.GaussianBlur(picture, (0, 0), 0.7)
     return _largest(cv2.threshold(smooth, 0, 1, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)[1].astype(bool))
 
 
-def threshold_by_neighbours(mask: Mask) -> Mask:
+def threshold_by_neighbours(picture: NDArray[np.uint8]) -> Mask:
     """The mask of the pixels that are darker than the 31 x 31 pixels around them."""
-    smooth = cv2.GaussianBlur(photograph(mask), (0, 0), 0.7)
+    smooth = cv2.GaussianBlur(picture, (0, 0), 0.7)
     kind = cv2.ADAPTIVE_THRESH_MEAN_C
     return _largest(cv2.adaptiveThreshold(smooth, 1, kind, cv2.THRESH_BINARY_INV, 31, 3).astype(bool))
 
@@ -69,8 +73,8 @@ MASK_ERRORS: dict[str, Callable[[Mask], Mask]] = {
     "grown": binary_dilation,
     "shrunk": lambda mask: binary_erosion(mask, border_value=1),
     "shifted": lambda mask: np.concatenate([mask[:, :1], mask[:, :-1]], axis=1),
-    "otsu": threshold_by_otsu,
-    "adaptive": threshold_by_neighbours,
+    "otsu": lambda mask: threshold_by_otsu(photograph(mask)),
+    "adaptive": lambda mask: threshold_by_neighbours(photograph(mask)),
 }
 _LONGEST_ROUTE_PX = 160
 _LETTER = {"left": "W", "right": "E", "top": "S", "bottom": "N"}

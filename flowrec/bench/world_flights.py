@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 from flowrec.bench.harness import flow_scores
 from flowrec.bench.null_models import NULL_MODELS, NullModel
 from flowrec.bench.planted_causes import count_causes, planted_causes
-from flowrec.core import BY_FIELD, FlowField, FlowrecError, Phase, Tick, WorkOrder, message_fields, seconds
+from flowrec.bench.second_worlds import SECOND_WORLDS, make_survey
+from flowrec.core import BY_FIELD, Floats, FlowField, FlowrecError, Phase, Tick, WorkOrder, message_fields, seconds
 from flowrec.physics import Chip, load_chip
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, run, work
@@ -79,6 +81,7 @@ WORLDS: Mapping[str, Callable[[Given], Sequence[str]]] = {
     "optics": lambda _: ("optics=oblique",),
 }
 _FAULT_STREAM = 0xFA017
+UNEXPLAINED = "nothing it knows explains"  # words of a field that is doubtful
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +178,9 @@ def in_world(
 
 
 def fly(case: FlightCase) -> Flight:
-    """Fly a case; nothing is written."""
+    """Fly a case; nothing is written. A world of the second generator is a survey that its seed gives."""
+    if case.world in SECOND_WORLDS:
+        return Flight(case.world, case.chip, case.seed, case.sets, "surveyed", "", order={"seed": case.seed})
     flight = Flight(case.world, case.chip, case.seed, case.sets, "refused", "")
     try:
         config, chip = prepare_case(case)
@@ -204,24 +209,58 @@ def fly(case: FlightCase) -> Flight:
     return flight
 
 
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A refinement problem, the verb that solves it by a method, and what judges the result."""
+
+    assumed: FlowField
+    refine_by: Callable[[str], FlowField]
+    truth_um_s: NDArray[np.floating]  # (h, w, 2)
+    fluid: NDArray[np.bool_]  # (h, w) where it is compared
+    planted: Sequence[str]
+    seen_um: Floats  # (n, 2) where the flow was observed
+
+
 def refine(flight: Flight, methods: Sequence[str]) -> None:
     """Refine what a flight has observed by some methods and score them; also the assumed flow, as `assumed`."""
     if not flight.order:
         return
+    judged = _problem_of_survey(flight) if flight.world in SECOND_WORLDS else _problem_of_flight(flight)
+    flight.refined["assumed"] = score_field(judged.assumed, judged)
+    for method in methods:
+        try:
+            result = judged.refine_by(method)
+        except FlowrecError as error:
+            flight.refined[method] = {"failed": str(error)}
+            continue
+        flight.refined[method] = score_field(result, judged)
+
+
+def _problem_of_flight(flight: Flight) -> Judged:
     config, chip = prepare_case(FlightCase(flight.world, flight.chip, flight.seed, flight.sets))
     pipeline = assemble(config, chip)
     truth = SimulatedRig.of(pipeline, config).true_world().field.velocity_um_s * np.float32(flight.drift)
     order = _order_of(flight, pipeline)
-    assert order.assumed is not None
-    planted = planted_causes(config, chip)
-    flight.refined["assumed"] = score_field(order.assumed, truth, chip.mask)
-    for method in methods:
-        try:
-            result = _refine_order(order, pipeline, config, chip, method)
-        except FlowrecError as error:
-            flight.refined[method] = {"failed": str(error)}
-            continue
-        flight.refined[method] = score_field(result, truth, chip.mask, planted)
+    assert order.assumed is not None and order.observations is not None
+    by = partial(_refine_order, order, pipeline, config, chip)
+    return Judged(order.assumed, by, truth, chip.mask, planted_causes(config, chip), order.observations.position_um)
+
+
+def _problem_of_survey(flight: Flight) -> Judged:
+    """The survey of a world of the second generator, made again from its seed."""
+    made = make_survey(flight.world, flight.seed)
+    config = load_config(None, flight.sets)
+    solver = config.flow
+    assumed = solver.solve(made.chip)
+
+    def refine_by(method: str) -> FlowField:
+        if method in NULL_MODELS:
+            return NullModel(method).refine(assumed, made.observations, made.chip, solver)
+        refiner = replace(config.refine, method=method, adopt="always")
+        return refiner.refine(assumed, made.observations, made.chip, solver)
+
+    both = made.fluid & made.chip.mask
+    return Judged(assumed, refine_by, made.truth_um_s, both, made.planted, made.observations.position_um)
 
 
 def _refine_order(order: Tick, pipeline: Pipeline, config: ResolvedConfig, chip: Chip, method: str) -> FlowField:
@@ -235,17 +274,25 @@ def _refine_order(order: Tick, pipeline: Pipeline, config: ResolvedConfig, chip:
     return result
 
 
-def score_field(
-    found: FlowField, truth: NDArray[np.float32], mask: NDArray[np.bool_], planted: Sequence[str] = ()
-) -> dict[str, Any]:
-    """`flow_scores` over the fluid pixels, and what the field says of itself.
+def score_field(found: FlowField, judged: Judged) -> dict[str, Any]:
+    """`flow_scores` over the pixels that are compared, and what the field says of itself.
 
     expected : the error that it states. warned : whether the note names a planted cause, on the right side; invented :
-    clauses that name another one (planted_causes.py).
+    clauses that name another one (planted_causes.py). doubted : whether it says that nothing it knows explains the flow
+    somewhere. beyond : root mean square error over root mean square bar at the places that were observed.
     """
-    right, invented = count_causes(found.note, planted)
+    right, invented = count_causes(found.note, judged.planted)
     said = {"expected": found.error_share, "warned": right > 0, "invented": invented, "note": found.note}
-    return flow_scores(found, truth, mask) | said
+    said["doubted"] = UNEXPLAINED in found.note
+    if found.std_um_s is not None:
+        column, row = np.round(judged.seen_um / found.um_per_px).astype(int).T
+        h, w = judged.fluid.shape
+        column, row = np.clip(column, 0, w - 1), np.clip(row, 0, h - 1)
+        here = judged.fluid[row, column]
+        off = (found.velocity_um_s - judged.truth_um_s)[row, column][here]
+        bars = float(np.linalg.norm(found.std_um_s[row, column][here]))
+        said["beyond"] = float(np.linalg.norm(off)) / max(bars, 1e-12)
+    return flow_scores(found, judged.truth_um_s, judged.fluid) | said
 
 
 def _as_json(message: Any) -> dict[str, Any]:

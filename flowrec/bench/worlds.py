@@ -22,6 +22,7 @@ import typer
 
 from flowrec.bench.harness import Results, choose_names, mean_with_interval, paired_ratio, print_rows, stated_over_true
 from flowrec.bench.null_models import NULL_MODELS
+from flowrec.bench.second_worlds import SECOND_WORLDS
 from flowrec.bench.world_flights import WORLDS, Flight, FlightCase, as_line, fly, refine
 from flowrec.core import UsageError, append_line, pool, progress, provenance, replace_content, say
 from flowrec.stages import REFINERS
@@ -35,7 +36,14 @@ _WORSE = 1.0  # times the assumed error, above which a refined map is worse
 
 
 def measure(
-    worlds: Annotated[str | None, typer.Option(metavar="A,B", help=f"Of {', '.join(WORLDS)}; by default all.")] = None,
+    worlds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B",
+            help=f"Of {', '.join(WORLDS)}, which are flown, and of the second generator, which are surveys: "
+            f"{', '.join(SECOND_WORLDS)}; by default all.",
+        ),
+    ] = None,
     chips: Annotated[str, typer.Option(metavar="A,B", help="bifurcation, straight, vessels-SEED, or files.")] = CHIPS,
     seeds: Annotated[int, typer.Option(min=1, help="Flights in each world on each chip.")] = 20,
     first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 1,
@@ -54,13 +62,13 @@ def measure(
     UsageError
         If there is no such world or method, or `rows` is not a file of flights.
     """
-    names = choose_names("bench worlds: no world", worlds, WORLDS)
+    names = choose_names("bench worlds: no world", worlds, (*WORLDS, *SECOND_WORLDS))
     wanted = choose_names("bench worlds: no method", methods, KNOWN)
     cases = [
         FlightCase(world, chip, seed, tuple(sets or ()))
         for seed in range(first_seed, first_seed + seeds)
         for world in names
-        for chip in chips.split(",")
+        for chip in (["second"] if world in SECOND_WORLDS else chips.split(","))
     ]
     flights = {} if rows is None else {flight.key(): flight for flight in read_flights(rows)}
     code = _code()
@@ -234,7 +242,11 @@ def show(results: Results) -> None:
     )
     print_rows(
         "Missions, flown with the map of assimilate",
-        [{"world": world, **groups["all"]} for world, groups in results["summary"].items()],
+        [
+            {"world": world, **groups["all"]}
+            for world, groups in results["summary"].items()
+            if world not in SECOND_WORLDS
+        ],
         {
             **{"world": "{world}", "flights": "{flights}", "reached": "{reached}", "refused": "{refused}"},
             **{"with contact": "{with_contact}", "contacts": "{contacts}"},

@@ -13,6 +13,7 @@ from flowrec.bench.planted_causes import count_causes, planted_causes
 from flowrec.bench.world_flights import (
     WORLDS,
     FlightCase,
+    Judged,
     Given,
     chip_sets,
     fly,
@@ -92,16 +93,20 @@ def test_scores_are_the_published_ones():
     rng = np.random.default_rng(0)
     std = np.full((*chip.mask.shape, 2), 8.0, np.float32)
     noisy = truth.velocity_um_s + rng.normal(0.0, 8.0, truth.velocity_um_s.shape).astype(np.float32)
-    score = score_field(replace(truth, velocity_um_s=noisy, std_um_s=std), truth.velocity_um_s, chip.mask)
+    rows, columns = np.nonzero(chip.mask)
+    seen_um = chip.um_per_px * np.stack([columns, rows], axis=1)[::10]
+    judged = Judged(truth, lambda _: truth, truth.velocity_um_s, chip.mask, (), seen_um)
+    score = score_field(replace(truth, velocity_um_s=noisy, std_um_s=std), judged)
     rms = math.sqrt((truth.velocity_um_s[chip.mask].astype(float) ** 2).sum(axis=1).mean())
     assert score["error"] == pytest.approx(8.0 * math.sqrt(2.0) / rms, rel=0.02)
     assert score["within_2_sigma"] == pytest.approx(0.9545, abs=0.006)
     # The mean CRPS of a right Gaussian is sigma / sqrt(pi); wider and narrower ones score worse.
     assert score["crps"] == pytest.approx(8.0 / math.sqrt(math.pi) / rms, rel=0.03)
     for factor in (0.5, 2.0):
-        other = score_field(replace(truth, velocity_um_s=noisy, std_um_s=factor * std), truth.velocity_um_s, chip.mask)
+        other = score_field(replace(truth, velocity_um_s=noisy, std_um_s=factor * std), judged)
         assert other["crps"] > 1.02 * score["crps"]
-    bare = score_field(replace(truth, velocity_um_s=noisy, std_um_s=None), truth.velocity_um_s, chip.mask)
+        assert other["beyond"] == pytest.approx(1.0 / factor, rel=0.1)  # at the places that were observed
+    bare = score_field(replace(truth, velocity_um_s=noisy, std_um_s=None), judged)
     assert bare["crps"] == pytest.approx(8.0 * math.sqrt(2.0 / math.pi) / rms, rel=0.03)
     assert bare["within_2_sigma"] is None
 

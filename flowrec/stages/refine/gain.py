@@ -17,6 +17,7 @@ from flowrec.stages.refine.held_back import Scores, blocks, made_after, predicte
 from flowrec.stages.refine.method import RefinementProblem
 
 _FACTOR_STD = 1.0  # prior of the factor around 1: far wider than what any observation leaves
+_AT_REST = 0.05  # of the root mean square speed that was predicted: slower places say nothing of the spread
 _BISECTIONS = 40  # of ln s between 1e-4 and 1e4: to 1e-11 of their ratio
 
 
@@ -103,12 +104,14 @@ def _spread(predicted: Floats, measured: Floats, variance: Floats, known: float 
     It is that around a factor that is `known`, or else around the one that fits best.
     """
     square = (predicted**2).sum(axis=1)
-    freedom = 2.0 * len(square) - (1.0 if known is None else 0.0)
+    # Beside or beyond a wall no spread in proportion to the speed explains what was observed.
+    flows = square >= _AT_REST**2 * square.mean()
+    freedom = 2.0 * np.count_nonzero(flows) - (1.0 if known is None else 0.0)
 
     def excess(spread: float) -> float:
         factor = _factor(predicted, measured, variance, spread)[0] if known is None else known
         left = ((measured - factor * predicted) ** 2).sum(axis=1)
-        return float((left / (variance + spread**2 * square)).sum()) - freedom
+        return float((left / (variance + spread**2 * square))[flows].sum()) - freedom
 
     low, high = np.log(1e-4), np.log(1e4)
     if excess(0.0) <= 0.0:
