@@ -13,8 +13,8 @@ from flowrec.bench.planted_causes import count_causes, planted_causes
 from flowrec.bench.world_flights import (
     WORLDS,
     FlightCase,
-    Judged,
     Given,
+    Judged,
     chip_sets,
     fly,
     in_world,
