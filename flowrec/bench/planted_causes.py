@@ -19,7 +19,7 @@ from flowrec.stages import ResolvedConfig, calibration_of
 _NO_CAUSE = re.compile(
     r"assimilated|\d+ more distrusted|ignored|they say nothing|of (in|out)let|whether|they do not ask|not refined"
     r"|the assumed flow times|the observations scatter around it|residual|start|corrected|misfit|they scatter"
-    r"|null model|um per revolution they tell|far from what was assumed|viscosity|$"
+    r"|nothing it knows explains|null model|um per revolution they tell|far from what was assumed|viscosity|$"
 )
 # From where on a cause is one: as the sentences have it (refine/findings.py), the depth by what a lab knows of it.
 _ROBOT, _SCALE, _ANGLE_DEG, _OFFSET_PX, _WALLS_PX, _PUMP, _DEPTH = 0.02, 0.005, 0.3, 0.25, 0.25, 0.03, 0.05

@@ -81,7 +81,6 @@ WORLDS: Mapping[str, Callable[[Given], Sequence[str]]] = {
     "optics": lambda _: ("optics=oblique",),
 }
 _FAULT_STREAM = 0xFA017
-UNEXPLAINED = "nothing it knows explains"  # words of a field that is doubtful
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,7 +282,7 @@ def score_field(found: FlowField, judged: Judged) -> dict[str, Any]:
     """
     right, invented = count_causes(found.note, judged.planted)
     said = {"expected": found.error_share, "warned": right > 0, "invented": invented, "note": found.note}
-    said["doubted"] = UNEXPLAINED in found.note
+    said["doubted"] = "nothing it knows explains" in found.note
     if found.std_um_s is not None:
         column, row = np.round(judged.seen_um / found.um_per_px).astype(int).T
         h, w = judged.fluid.shape

@@ -52,7 +52,7 @@ from .planning.survey_design import (
     Need as Need, Sampling as Sampling, SurveyOrder as SurveyOrder, covariance_after as covariance_after,
 )
 from .refine.case import Case as Case
-from .refine.findings import scale_doubt as scale_doubt
+from .refine.findings import map_doubts as map_doubts
 from .refine.network import UNet as UNet, trained_network as trained_network
 from .refine.network_fit import Device as Device, torch_run as torch_run
 from .refine.network_inputs import LEAST_SPEED as LEAST_SPEED, LOG_STD as LOG_STD, NetworkInputs as NetworkInputs

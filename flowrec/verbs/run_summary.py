@@ -10,7 +10,7 @@ from typing import Any
 from flowrec.core import DOUBTS, Coverage, Figures, FlowField, Outcome, doubts_of, rows_for_people, say, table, warn
 from flowrec.physics import Chip
 from flowrec.run import RunReport
-from flowrec.stages import MotionOfRun, Pipeline, ResolvedConfig, TrackQuality, scale_doubt
+from flowrec.stages import MotionOfRun, Pipeline, ResolvedConfig, TrackQuality, map_doubts
 from flowrec.stages import figures_of as figures_of_ticks
 from flowrec.store import is_snapshot
 
@@ -113,13 +113,13 @@ def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> F
 def judge_refinement(
     refined: FlowField | None, config: ResolvedConfig, *, known_doubts: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Facts and doubts about the refined flow of a run; its scale is not doubted again if the walls' is."""
+    """Facts and doubts about the refined flow of a run, which is not doubted again if the walls' scale is."""
     facts: dict[str, str] = {}
     doubts: list[str] = []
     if refined is None:
         return facts, doubts
-    if not known_doubts and (scale := scale_doubt(refined, config.camera.um_per_px)):
-        doubts.append(scale)
+    if not known_doubts:
+        doubts += map_doubts(refined, config.camera.um_per_px)
     if refined.refused and refined.log_score is None:
         if config.refine.observes_flow:
             doubts.append(f"the flow was not refined: {refined.refused}")

@@ -43,9 +43,9 @@ from flowrec.stages import (
     ResolvedConfig,
     assemble,
     facts_of,
+    map_doubts,
     observe,
     other_packages,
-    scale_doubt,
     smooth,
 )
 from flowrec.store import (
@@ -111,8 +111,8 @@ def replay_session(
         result = replay.run(sinks)
         if writer is not None:
             refined = result.report.last.refined
-            scale = scale_doubt(refined, result.config.camera.um_per_px) if refined is not None else ""
-            result.doubts = [doubt for judge in judges for doubt in judge.doubts()] + [scale] * bool(scale)
+            result.doubts = [doubt for judge in judges for doubt in judge.doubts()]
+            result.doubts += map_doubts(refined, result.config.camera.um_per_px) if refined is not None else []
             _close(writer, result)
     if verify and segment_ns is None:
         replay.read_digest(result)

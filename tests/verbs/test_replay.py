@@ -297,7 +297,7 @@ def test_a_scale_that_the_refined_map_contradicts_is_a_doubt_of_the_replay(
     session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     doubt = "camera.um_per_px = 10 is 5 % too large"
-    monkeypatch.setattr(verb, "scale_doubt", lambda field, um_per_px: doubt if um_per_px and field.method else "")
+    monkeypatch.setattr(verb, "map_doubts", lambda field, um_per_px: [doubt] * bool(um_per_px and field.method))
     done = verb.replay_session(session, Change(refine="gain"), out=tmp_path / "again.mcap")
     assert done.doubts == [doubt] and done.exit_status == 3
     assert doubt in SessionReader(tmp_path / "again.mcap").outcome["doubts"]

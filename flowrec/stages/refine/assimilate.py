@@ -24,7 +24,7 @@ from flowrec.stages.refine.causes import AS_STATED, Observed
 from flowrec.stages.refine.discretisation_error import ModelError
 from flowrec.stages.refine.disturbances import held_back
 from flowrec.stages.refine.field_variance import expected_error, field_variance, prior_variance
-from flowrec.stages.refine.findings import findings, with_obstacle
+from flowrec.stages.refine.findings import explained_in_time, findings, with_departure, with_obstacle
 from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.held_back import scores_of
 from flowrec.stages.refine.hypothesis import (
@@ -43,6 +43,7 @@ from flowrec.stages.refine.hypothesis import (
 from flowrec.stages.refine.method import RefinementProblem
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.obstacles import PLACES, Obstacle, likely_obstacles, with_shape_error
+from flowrec.stages.refine.predictive_check import find_departure
 from flowrec.stages.refine.prior import PriorSettings
 from flowrec.stages.refine.report import over_error, report
 from flowrec.stages.refine.wall_bias import in_biased_walls
@@ -312,6 +313,14 @@ class Assimilate(PriorSettings):
         variance = np.zeros_like(mean)
         for one, flow, weight in zip(every.found, every.flows, every.weights, strict=True):
             variance += weight * (one.on_pixels_of(chip.mask, field_variance(one)) + (flow - mean) ** 2)
+        also = with_obstacle(findings(every.found, every.weights), chip, every.obstacle)
+        departure = find_departure(best)
+        if departure is not None and explained_in_time(also, departure):
+            departure = None
+        if departure is not None:
+            points = np.argwhere(chip.mask)[:, ::-1].astype(np.float64)
+            variance = np.maximum(variance, departure.least_variance(points, mean))
+            also = with_departure(also, departure, chip.um_per_px)
         model = best.observed.model
         z = best.posterior.mean
         fitted = model.prior.chip(model.chip, z)
@@ -325,7 +334,6 @@ class Assimilate(PriorSettings):
             (other.width_px / opening.width_px if opening.kind == "inlet" else 1.0)
             for other, opening in zip(model.chip.openings, chip.openings, strict=True)
         ]
-        also = with_obstacle(findings(every.found, every.weights), chip, every.obstacle)
         moved = over_error((velocity_um_s - problem.assumed.velocity_um_s)[chip.mask], std_um_s[chip.mask])
         note = report(chip, problem.operator, best, also.words, moved)
         scores = scores_of(best, problem.assumed, problem.before) if problem.hold_back else None

@@ -13,6 +13,7 @@ from flowrec.stages.refine.causes import LINE_NAME, WALL_BIAS_NAME, WANDER_S
 from flowrec.stages.refine.disturbances import SHAKE
 from flowrec.stages.refine.hypothesis import HypothesisFit
 from flowrec.stages.refine.obstacles import Obstacle
+from flowrec.stages.refine.predictive_check import NATS, UNEXPLAINED, Departure
 
 SURE = 2.5  # standard deviations from zero above which a cause is named
 PROBABLE = 0.9  # probability of a depth, or of none, above which it is said
@@ -72,6 +73,13 @@ class Findings:
         """
         index = self.names.index(name)
         return float(self.values[index]), float(self.stds[index])
+
+
+def map_doubts(field: FlowField, um_per_px: float) -> list[str]:
+    """Reasons to doubt a refined field, or the scale with which it was made; none where its causes explain it."""
+    unexplained = [clause.strip() for clause in field.note.split(";") if clause.strip().startswith(UNEXPLAINED)]
+    scale = scale_doubt(field, um_per_px)
+    return [*([scale] if scale else []), *(f"the refined flow: {clause}" for clause in unexplained)]
 
 
 def scale_doubt(field: FlowField, um_per_px: float) -> str:
@@ -219,6 +227,26 @@ def with_obstacle(found: Findings, chip: Chip, obstacle: tuple[Obstacle, float] 
         np.append(found.values, [x_um, y_um]),
         np.append(found.stds, 2 * [place.half_width_px * chip.um_per_px]),
         (f"a channel is partly blocked at ({x_um:.0f}, {y_um:.0f}) um", *found.words),
+    )
+
+
+def explained_in_time(found: Findings, departure: Departure) -> bool:
+    """True if a change of the flow in time is named, and a departure of the flow at that time would be one."""
+    in_time = ("the pump pulsates", "the flow changes", "the flow wanders")
+    return departure.nats_in_time > NATS and any(word.startswith(in_time) for word in found.words)
+
+
+def with_departure(found: Findings, departure: Departure | None, um_per_px: float) -> Findings:
+    """Add a departure from all causes."""
+    if departure is None:
+        return found
+    x_um, y_um = um_per_px * departure.place_px
+    std_um = um_per_px * departure.radius_px
+    return Findings(
+        (*found.names, "unexplained_x_um", "unexplained_y_um", "unexplained_share"),
+        np.append(found.values, [x_um, y_um, departure.share]),
+        np.append(found.stds, [std_um, std_um, departure.spread]),
+        (departure.words(um_per_px), *found.words),
     )
 
 
