@@ -49,8 +49,12 @@ WORDS = {
 }
 UNSURE = 0.04  # of um per revolution: a larger standard deviation is worth a word
 MOVED_PX = 0.25  # least offset of the registration, or of walls, that is worth a word, in pixels of the mask
+BIASED = 1.5  # standard deviations of walls that are all off: that they are so has been weighed already
 WANDERS, PULSATES = 0.06, 0.03  # likewise of the flow in time, and of a line of the pump
 OTHER_SCALE, OTHER_SCALE_STDS = 0.02, 3.0  # of um_per_px_share from which on a session is doubtful
+IN_TIME = ("the pump pulsates", "the flow changes", "the flow wanders")  # beginnings of sentences
+# Likewise of effects that follow a departure from all causes where they can.
+TAKEN_FOR = (*IN_TIME, "the image shakes", "the walls seem off", "near walls the robot rolls")
 PERIODS = 1.5  # of a line in the time that was observed; with fewer, a place that was passed once looks like it
 
 
@@ -140,7 +144,7 @@ def _bias_words(found: Sequence[HypothesisFit], weights: Floats) -> list[str]:
     mean, covariance = found[biased[0]].unknowns(WALL_BIAS_NAME)
     px = found[biased[0]].observed.um_per_px
     outside_um, std_um = px * float(mean[0]), px * float(np.sqrt(covariance[0, 0]))
-    if abs(outside_um) < MOVED_PX * px:
+    if abs(outside_um) < max(MOVED_PX * px, BIASED * std_um):
         return []
     seems = "seems" if share > PROBABLE else f"may be ({share:.0%})"
     way = "narrow" if outside_um > 0.0 else "wide"
@@ -232,12 +236,11 @@ def with_obstacle(found: Findings, chip: Chip, obstacle: tuple[Obstacle, float] 
 
 def explained_in_time(found: Findings, departure: Departure) -> bool:
     """True if a change of the flow in time is named, and a departure of the flow at that time would be one."""
-    in_time = ("the pump pulsates", "the flow changes", "the flow wanders")
-    return departure.nats_in_time > NATS and any(word.startswith(in_time) for word in found.words)
+    return departure.nats_in_time > NATS and any(word.startswith(IN_TIME) for word in found.words)
 
 
 def with_departure(found: Findings, departure: Departure | None, um_per_px: float) -> Findings:
-    """Add a departure from all causes."""
+    """Add a departure from all causes. A cause that a departure may have been taken for is not said beside it."""
     if departure is None:
         return found
     x_um, y_um = um_per_px * departure.place_px
@@ -246,7 +249,7 @@ def with_departure(found: Findings, departure: Departure | None, um_per_px: floa
         (*found.names, "unexplained_x_um", "unexplained_y_um", "unexplained_share"),
         np.append(found.values, [x_um, y_um, departure.share]),
         np.append(found.stds, [std_um, std_um, departure.spread]),
-        (departure.words(um_per_px), *found.words),
+        (departure.words(um_per_px), *(word for word in found.words if not word.startswith(TAKEN_FOR))),
     )
 
 

@@ -197,7 +197,10 @@ def outlying(robust: Robust) -> float:
 
 
 def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
-    """A stage that shakes, where observations scatter more than they state and one frequency explains that."""
+    """A stage that shakes, where observations scatter more than they state and one frequency explains that.
+
+    A pump that pulsates at that frequency must not explain it as well.
+    """
     here, base = observed.operator, observed.model.base
     if here.time_s is None or robust.factor < NOISIER:
         return None
@@ -210,7 +213,8 @@ def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
     shaken = replace(observed, operator=replace(here, disturbances=(*here.disturbances, found)))
     calmer = robust_noise(shaken)
     after = first_evidence(shaken, calmer) - outlying(calmer)
-    return found if after > sizes.evidence - outlying(robust) + WORTH_A_SHAKE else None
+    pump = _evidence(observed, robust, np.zeros_like(base), base, hz).sizes(None).evidence
+    return found if after > max(sizes.evidence + WORTH_A_SHAKE, pump) - outlying(robust) else None
 
 
 def noise_variance(operator: ObservationOperator) -> Floats:

@@ -157,7 +157,7 @@ def _gains(weights: Floats, vectors: Floats, covariance: Floats, y: Floats) -> t
 
 
 def _without_catch_alls(found: HypothesisFit, average: Floats) -> tuple[Floats, Floats]:
-    """Covariance (m, m) of the observations by causes and noise; they (2, m) with clipped residuals, and as they are."""
+    """Covariance (m, m) of the observations by causes and noise; they (2, m), clipped and as they are."""
     evidence, mode = found.evidence, found.sizes.mode
     names = [effect.name for effect in evidence.effects]
     noise = names.index(NOISE[0])
