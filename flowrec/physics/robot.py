@@ -6,7 +6,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from flowrec.core import FlowField, PositiveShare, Range
+import numpy as np
+
+from flowrec.core import Floats, FlowField, PositiveShare, Range
 
 _SIGNIFICANT = 2.0  # standard deviations
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
@@ -67,6 +69,15 @@ class Robot(RobotSettings):
             return self
         slower = min(1.0 + change, 1.0)
         return replace(self, max_speed_um_s=slower * self.max_speed_um_s, um_per_rev=(1.0 + change) * self.um_per_rev)
+
+    @staticmethod
+    def course_turn(refined: FlowField | None) -> Floats | None:
+        """The turn (2, 2) from heading to course that a refinement found; None where it is not significant."""
+        found = None if refined is None else refined.parameter("heading_deg")
+        if found is None or abs(found[0]) <= _SIGNIFICANT * found[1]:
+            return None
+        c, s = math.cos(math.radians(found[0])), math.sin(math.radians(found[0]))
+        return np.array([[c, -s], [s, c]])
 
     def speed_limit_at(self, strength: float) -> float:
         """Speed limit in a field of this fraction of the full amplitude, um/s: step-out falls with the torque."""

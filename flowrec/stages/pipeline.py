@@ -311,11 +311,13 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         known, seen = p.robot.learned_from(tick.refined), flow
     else:
         known, seen = p.robot, None if flow is None else _without_registration(flow)
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, known, seen, last.health)
+    turn = known.course_turn(tick.refined) if p.refiner.correct_heading else None
+    applied = inputs.applied if turn is None else replace(inputs.applied, turns=turn @ inputs.applied.turns)
+    estimate = p.observer.estimate(last.estimate, track, applied, known, seen, last.health)
     # The robot with the estimated um_per_rev, if the observer estimates it.
     robot = known if estimate.um_per_rev is None else replace(known, um_per_rev=estimate.um_per_rev)
     # Sessions recorded before step-out was monitored replay without it.
-    looked = inputs.applied if inputs.applied.image_since_ns is not None else None
+    looked = applied if applied.image_since_ns is not None else None
     # Observations, their predictions and the pictures keep to the registration as stated.
     placed = _place_on_chip(estimate, tick.refined)
     wall_um = _wall_um(p, placed.position_um)
@@ -326,7 +328,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     mapless, measured = last.mapless, estimate
     if p.sampler.without_map:
         # Observations are those of the robot as stated: what a refinement finds of it, the next one finds again.
-        corrected = known is not p.robot
+        corrected = known is not p.robot or turn is not None
         mapless = p.observer.without_map(
             last.mapless, last.estimate, estimate, track, inputs.applied, p.robot, corrected=corrected
         )
@@ -370,7 +372,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO
     cut = cut or mission.field_off
-    currents = p.coils.drive(last.currents, demand, robot, mission.finished, cut)
+    # Of a robot that leaves its heading, the heading is turned back by as much.
+    ordered = demand if turn is None else replace(demand, velocity_um_s=turn.T @ demand.velocity_um_s)
+    currents = p.coils.drive(last.currents, ordered, robot, mission.finished, cut)
     lap("control")
     tick = replace(
         tick,

@@ -78,6 +78,31 @@ def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no
     assert flown(-0.2, pipeline=stated).estimate.same_as(plain.estimate)
 
 
+def test_the_course_that_a_refinement_found_turns_observer_and_coils_and_no_observation(navigation):
+    pipeline, ticks = navigation
+
+    def flown(heading_deg, std=1.0, pipeline=pipeline):
+        found = replace(ticks[3].field, parameter_names="heading_deg", parameters=np.array([heading_deg]))
+        last = replace(ticks[3], refined=replace(found, parameter_std=np.array([std])))
+        return after(pipeline, last, ticks[4:30])
+
+    plain, corrected = flown(0.0), flown(10.0)
+    before, now = (tick.estimate.rolled_um_s for tick in (plain, corrected))
+    assert np.arctan2(before[0] * now[1] - before[1] * now[0], before @ now) == pytest.approx(
+        np.deg2rad(10.0), abs=0.01
+    )
+    assert np.hypot(*now) == pytest.approx(np.hypot(*before), rel=0.01)
+    away = [
+        np.angle(np.exp(1j * (tick.currents.heading_rad - np.arctan2(*tick.demand.velocity_um_s[::-1]))), deg=True)
+        for tick in (plain, corrected)
+    ]
+    assert away == pytest.approx([0.0, -10.0], abs=1e-6)
+    assert corrected.observations.same_as(plain.observations)
+    assert flown(10.0, std=6.0).estimate.same_as(plain.estimate), "not significant"
+    stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_heading=False))
+    assert flown(10.0, pipeline=stated).estimate.same_as(plain.estimate)
+
+
 def test_an_observer_that_corrects_the_map_reads_it_where_the_registration_puts_the_robot(navigation):
     pipeline, ticks = navigation
     pipeline = replace(pipeline, observer=replace(pipeline.observer, method="kalman_map"))

@@ -109,6 +109,8 @@ class Refiner:
     # Observer, health and controller take the um per revolution that the refinement found, and read the map where its
     # registration puts the robot.
     correct_robot: bool = True
+    # Observer, health and coils take the angle that it found between the robot's heading and its course.
+    correct_heading: bool = True
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)
     ni: Ni = field(default_factory=Ni)
