@@ -32,10 +32,10 @@ def test_the_mask_holds_the_pixels_of_which_half_is_fluid_and_their_centres_are_
     assert np.array_equal(to_fine(np.array([[0.0, 0.0], [2.0, 1.0]])), [[1.0, 1.0], [2 * FINE + 1, FINE + 1]])
 
 
-@pytest.mark.parametrize("world", ["otsu", "adaptive", "dilated", "eroded", "leak", "growing_bubble"])
+@pytest.mark.parametrize("world", ["adaptive", "dilated", "eroded", "growing_bubble"])
 def test_a_wrong_mask_is_the_laboratorys_and_another_channel_is_the_truths(world: str) -> None:
     right, wrong = make_survey("as_stated", 4), make_survey(world, 4)
-    if world in ("leak", "growing_bubble"):
+    if world == "growing_bubble":
         assert np.array_equal(right.chip.mask, wrong.chip.mask)
         assert (right.fluid != wrong.fluid).sum() >= 4
     else:
@@ -44,7 +44,7 @@ def test_a_wrong_mask_is_the_laboratorys_and_another_channel_is_the_truths(world
         assert change < 0 if world == "eroded" else change > 0 if world == "dilated" else change
 
 
-@pytest.mark.parametrize("world", ["roller", "drag", "slip_by_place", "late_clock", "weak_robot", "drifting_stage"])
+@pytest.mark.parametrize("world", ["roller", "drag", "late_clock", "drifting_stage"])
 def test_a_fault_of_robot_or_pump_changes_what_is_measured_and_not_the_mask(world: str) -> None:
     right, wrong = make_survey("as_stated", 4), make_survey(world, 4)
     assert np.array_equal(right.chip.mask, wrong.chip.mask)

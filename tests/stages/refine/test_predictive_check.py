@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from flowrec.core.messages import FlowField, Observations
 from flowrec.stages.refine import Refiner
@@ -59,9 +58,8 @@ def test_a_flow_that_no_cause_explains_is_said_where_it_is_and_its_bars_reach_wh
     assert UNEXPLAINED in doubt
 
 
-@pytest.mark.parametrize("every", [1, 3])
-def test_chance_and_single_outliers_are_no_departure(twin, every):
-    for seed in range(6):
+def test_chance_and_single_outliers_are_no_departure(twin):
+    for seed, every in ((0, 1), (1, 1), (2, 3)):
         case = twin(every=every, seed=seed)
         wrong = case.observations.flow_um_s.copy()
         wrong[np.random.default_rng(seed).choice(len(wrong), 2, replace=False)] *= -3.0
@@ -73,8 +71,8 @@ def test_chance_and_single_outliers_are_no_departure(twin, every):
 
 
 def test_noise_that_is_twice_as_large_as_stated_is_no_departure(twin):
-    for seed in range(4):
-        case = twin(every=1, seed=seed, noise=0.1)
+    for seed in range(2):
+        case = twin(every=2, seed=seed, noise=0.1)
         stated = replace(case.observations, std_um_s=0.5 * case.observations.std_um_s)
         assert UNEXPLAINED not in refine(case, stated).note
 
