@@ -43,6 +43,9 @@ class MmcoreCamera:
             raise RigError(f"lab.trigger = {wanted.trigger!r}: with mmcore, set the trigger in the configuration file")
         try:
             self._core = core = CMMCorePlus()
+            # Its events are not used. Without them no thread of Micro-Manager runs Python, where a garbage collection
+            # that frees another core would end the process.
+            super(CMMCorePlus, core).registerCallback(None)
             label = self._load(core)
             notes = self._set(core, label)
             self._bits = core.getImageBitDepth()

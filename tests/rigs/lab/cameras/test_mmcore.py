@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +39,30 @@ def test_the_demonstration_camera_delivers_every_depth(bits: int) -> None:
         assert frame.bits == bits and frame.image.shape == (48, 64) and frame.image.max() < 1 << bits
         assert frame.image.dtype == (np.uint8 if bits == 8 else np.uint16)
     assert (grabber.info.exposure_s, grabber.info.gain) == (0.01, 2.0)
+
+
+def test_no_thread_of_micro_manager_runs_python_where_a_garbage_collection_would_end_the_process() -> None:
+    collected_in: set[str] = set()
+
+    def note(phase: str, info: dict[str, int]) -> None:
+        collected_in.add(threading.current_thread().name)
+
+    threshold, enabled = gc.get_threshold(), gc.isenabled()
+    gc.callbacks.append(note)
+    gc.set_threshold(20, 2, 2)
+    gc.enable()
+    try:
+        for _ in range(20):
+            camera = MmcoreCamera.of(WANTED)
+            camera.open()
+            assert camera.grab(1.0) is not None
+            camera.close()
+    finally:
+        gc.callbacks.remove(note)
+        gc.set_threshold(*threshold)
+        if not enabled:
+            gc.disable()
+    assert collected_in and not [name for name in collected_in if name.startswith("Dummy")]  # a foreign thread
 
 
 def test_stamps_are_the_times_at_which_micro_manager_received_the_images() -> None:
