@@ -24,7 +24,7 @@ from flowrec.stages.refine.causes import AS_STATED, Observed
 from flowrec.stages.refine.discretisation_error import ModelError
 from flowrec.stages.refine.disturbances import held_back
 from flowrec.stages.refine.field_variance import expected_error, field_variance, prior_variance
-from flowrec.stages.refine.findings import explained_in_time, findings, with_departure, with_obstacle
+from flowrec.stages.refine.findings import explained_by_pump, findings, wanders, with_departure, with_obstacle
 from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.held_back import scores_of
 from flowrec.stages.refine.hypothesis import (
@@ -315,11 +315,12 @@ class Assimilate(PriorSettings):
             variance += weight * (one.on_pixels_of(chip.mask, field_variance(one)) + (flow - mean) ** 2)
         also = with_obstacle(findings(every.found, every.weights), chip, every.obstacle)
         departure = find_departure(best)
-        if departure is not None and explained_in_time(also, departure):
+        if departure is not None and explained_by_pump(also, departure):
             departure = None
         if departure is not None:
             points = np.argwhere(chip.mask)[:, ::-1].astype(np.float64)
-            variance = np.maximum(variance, departure.least_variance(points, mean))
+            if not (departure.in_time and wanders(also)):  # the bars have grown by the wander already
+                variance = np.maximum(variance, departure.least_variance(points, mean))
             also = with_departure(also, departure, chip.um_per_px)
         model = best.observed.model
         z = best.posterior.mean

@@ -52,9 +52,12 @@ MOVED_PX = 0.25  # least offset of the registration, or of walls, that is worth 
 BIASED = 1.5  # standard deviations of walls that are all off: that they are so has been weighed already
 WANDERS, PULSATES = 0.06, 0.03  # likewise of the flow in time, and of a line of the pump
 OTHER_SCALE, OTHER_SCALE_STDS = 0.02, 3.0  # of um_per_px_share from which on a session is doubtful
-IN_TIME = ("the pump pulsates", "the flow changes", "the flow wanders")  # beginnings of sentences
+PULSATION, WANDER = "the pump pulsates", "the flow wanders"  # beginnings of sentences
 # Likewise of effects that follow a departure from all causes where they can.
-TAKEN_FOR = (*IN_TIME, "the image shakes", "the walls seem off", "near walls the robot rolls")
+TAKEN_FOR = (
+    *(PULSATION, WANDER, "the flow changes", "the image shakes"),
+    *("the walls seem off", "near walls the robot rolls"),
+)
 PERIODS = 1.5  # of a line in the time that was observed; with fewer, a place that was passed once looks like it
 
 
@@ -234,9 +237,17 @@ def with_obstacle(found: Findings, chip: Chip, obstacle: tuple[Obstacle, float] 
     )
 
 
-def explained_in_time(found: Findings, departure: Departure) -> bool:
-    """True if a change of the flow in time is named, and a departure of the flow at that time would be one."""
-    return departure.nats_in_time > NATS and any(word.startswith(IN_TIME) for word in found.words)
+def explained_by_pump(found: Findings, departure: Departure) -> bool:
+    """True if a pump that pulsates is named, and a departure of the flow at that time would be one.
+
+    A flow that wanders is no explanation: where nothing is known of the pump, any departure is a wander.
+    """
+    return departure.nats_in_time > NATS and any(word.startswith(PULSATION) for word in found.words)
+
+
+def wanders(found: Findings) -> bool:
+    """True if a wander of the flow is named."""
+    return any(word.startswith(WANDER) for word in found.words)
 
 
 def with_departure(found: Findings, departure: Departure | None, um_per_px: float) -> Findings:

@@ -71,6 +71,11 @@ class Departure:
     heading_rad: float | None
 
     @property
+    def in_time(self) -> bool:
+        """True if the window is one of time."""
+        return self.nats == self.nats_in_time
+
+    @property
     def share(self) -> float:
         """Size of the departure, over the flow."""
         return float(np.hypot(self.along, self.across))

@@ -9,7 +9,7 @@ import numpy as np
 
 from flowrec.core.messages import FlowField, Observations
 from flowrec.stages.refine import Refiner
-from flowrec.stages.refine.findings import map_doubts
+from flowrec.stages.refine.findings import TAKEN_FOR, map_doubts
 from flowrec.stages.refine.predictive_check import UNEXPLAINED
 
 REFINER = Refiner(adopt="always")
@@ -54,8 +54,18 @@ def test_a_flow_that_no_cause_explains_is_said_where_it_is_and_its_bars_reach_wh
     off = np.abs(np.stack([field.velocity_um_s, usual.velocity_um_s])[:, row, column] - seen).max(axis=1)
     bars = np.stack([field.std_um_s, usual.std_um_s])[:, row, column].max(axis=1)
     assert off[0] < 2.0 * bars[0] and off[1] > 5.0 * bars[1]
+    stem = 240 // 10, 60 // 10  # everywhere else by the mean of what was found
+    assert (field.std_um_s[stem] > 1.2 * usual.std_um_s[stem]).any()
     (doubt,) = map_doubts(field, case.chip.um_per_px)
     assert UNEXPLAINED in doubt
+
+
+def test_a_wander_of_the_flow_is_no_explanation_and_is_not_said_beside_what_nothing_explains(twin):
+    case = twin(every=1)
+    seen = slower_at(case, 0.4)
+    field = refine(case, replace(seen, time_s=0.6 * np.arange(len(seen.std_um_s))))
+    assert UNEXPLAINED in field.note
+    assert not [clause for clause in field.note.split("; ") if clause.startswith(TAKEN_FOR)]
 
 
 def test_chance_and_single_outliers_are_no_departure(twin):
@@ -91,4 +101,4 @@ def test_what_an_unsteady_pump_explains_is_said_of_the_pump(twin):
     seen = replace(case.observations, flow_um_s=case.observations.flow_um_s * pulsates[:, None], time_s=time_s)
     field = refine(case, seen)
     assert "the pump pulsates" in field.note
-    assert UNEXPLAINED not in field.note
+    assert UNEXPLAINED not in field.note and "shakes" not in field.note
