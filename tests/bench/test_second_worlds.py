@@ -80,6 +80,19 @@ def test_a_survey_is_refined_and_scored_like_a_flight() -> None:
     assert found["warned"]
 
 
+@pytest.mark.parametrize(
+    ("world", "seed", "doubted"), [("growing_bubble", 3, 1), ("late_clock", 2, 1), ("roller", 2, 0)]
+)
+def test_what_no_cause_explains_is_said_alone_and_a_pump_that_pulsates_explains_it(world, seed, doubted) -> None:
+    flight = fly(FlightCase(world, "second", seed))
+    refine(flight, ["assimilate"])
+    found = flight.refined["assimilate"]
+    assert found["doubted"] == bool(doubted)
+    assert found["beyond"] < 2.0
+    taken_for = ("the pump pulsates", "the flow wanders", "the walls seem off")
+    assert any(words in found["note"] for words in taken_for) != bool(doubted)
+
+
 def test_the_truth_does_not_depend_on_the_subcells_of_its_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     coarse_truth = make_survey("as_stated", 4).truth_um_s
     monkeypatch.setattr(second, "FlowSolver", lambda _: FlowSolver(2))
