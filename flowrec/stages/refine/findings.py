@@ -251,16 +251,20 @@ def wanders(found: Findings) -> bool:
 
 
 def with_departure(found: Findings, departure: Departure | None, um_per_px: float) -> Findings:
-    """Add a departure from all causes. A cause that a departure may have been taken for is not said beside it."""
+    """Add a departure from all causes. A cause that a departure may have been taken for is not said beside it.
+
+    A wander of the flow is said beside a departure in time, which may be the largest part of it.
+    """
     if departure is None:
         return found
+    hidden = tuple(words for words in TAKEN_FOR if not (departure.in_time and words == WANDER))
     x_um, y_um = um_per_px * departure.place_px
     std_um = um_per_px * departure.radius_px
     return Findings(
         (*found.names, "unexplained_x_um", "unexplained_y_um", "unexplained_share"),
         np.append(found.values, [x_um, y_um, departure.share]),
         np.append(found.stds, [std_um, std_um, departure.spread]),
-        (departure.words(um_per_px), *(word for word in found.words if not word.startswith(TAKEN_FOR))),
+        (departure.words(um_per_px), *(word for word in found.words if not word.startswith(hidden))),
     )
 
 
