@@ -10,6 +10,7 @@ from flowrec.core.system.blas_threads import one_blas_thread
 from flowrec.physics.chip.fluid import PowerLaw
 from flowrec.stages.refine import Assimilate, Refiner
 from flowrec.stages.refine.findings import scale_doubt
+from flowrec.stages.refine.predictive_check import UNEXPLAINED
 from flowrec.stages.refine.observation_operator import observation_operator
 from flowrec.stages.refine.report import report
 from tests.stages.refine.planted import (
@@ -121,7 +122,8 @@ def test_a_flow_that_wanders_is_said_with_what_it_wandered_by():
     for seed in (1, 2):
         lab = Laboratory(wander=0.15)
         factor = lab.pump_factor(lab.step_s * np.arange(56), seed)
-        (sentence,) = refined(lab, seed=seed)[1]
+        # So large a wander is none that a map can be sure of: the largest part of it is said, too.
+        (sentence,) = [one for one in refined(lab, seed=seed)[1] if not one.startswith(UNEXPLAINED)]
         words = "the flow wanders in time, or by place along the way, by {} %"
         within(sentence, words, 100.0 * float(np.std(factor) / factor.mean()))
 
