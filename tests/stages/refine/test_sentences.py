@@ -10,8 +10,8 @@ from flowrec.core.system.blas_threads import one_blas_thread
 from flowrec.physics.chip.fluid import PowerLaw
 from flowrec.stages.refine import Assimilate, Refiner
 from flowrec.stages.refine.findings import scale_doubt
-from flowrec.stages.refine.predictive_check import UNEXPLAINED
 from flowrec.stages.refine.observation_operator import observation_operator
+from flowrec.stages.refine.predictive_check import UNEXPLAINED
 from flowrec.stages.refine.report import report
 from tests.stages.refine.planted import (
     RADIUS_UM,
