@@ -72,7 +72,7 @@ def coarse(fine: Bools) -> Bools:
 
 
 def draw_chip(rng: np.random.Generator) -> DrawnChip:
-    """Draw a trunk from the left border, two or three branches, perhaps a twig, a loop and a pool."""
+    """Draw a trunk from the left border, two or three branches, perhaps a loop and a pool."""
     side = float(SIDE_PX)
     fork = side * rng.uniform((0.26, 0.38), (0.44, 0.62))
     width = float(rng.uniform(9.0, 15.0))

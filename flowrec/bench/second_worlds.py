@@ -7,7 +7,7 @@ of up to 15 % of the pressure drop), and one fault or two, of a size that its se
 sources than the model's and the rig's: drag beside a wall by lubrication (ln of radius over gap), pumps by their
 rollers or by their steps, viscosity by Cross (1965).
 
-Seeds under HELD_OUT are for development, those from it on for figures.
+Seeds under 1000 are for development, those from it on for figures.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from flowrec.bench.vessels import photograph, threshold_by_neighbours, threshold
 from flowrec.core import Bools, Floats, FlowError, FlowField, Observations
 from flowrec.physics import CarreauYasuda, Chip, FlowSolver, Opening, find_openings
 
-HELD_OUT = 1_000  # first seed of the figures
 UM_PER_PX = 10.0
 RADIUS_UM = 8.0  # of the robot
 STEP_S = 0.05  # of the robot's way
@@ -190,7 +189,7 @@ def _weak_robot(world: SecondWorld) -> None:
     world.um_per_rev_share *= 1.0 + world.rng.uniform(0.08, 0.2) * world.rng.choice([-1.0, 1.0])
 
 
-def _outliers(world: SecondWorld) -> None:
+def _noisy(world: SecondWorld) -> None:
     world.noise *= 2.0
 
 
@@ -213,7 +212,7 @@ _KINDS: Mapping[str, tuple[Callable[[SecondWorld], None], str]] = {
     "occlusion": (_occlusion, "$^"),
     "other_scale": (_scale, "the image scale|the chip lies .* from where"),
     "weak_robot": (_weak_robot, "per revolution than stated"),
-    "noisy": (_outliers, "$^"),
+    "noisy": (_noisy, "$^"),
 }
 SECOND_WORLDS = ("as_stated", *_KINDS, "two_faults")
 
@@ -244,6 +243,7 @@ def make_survey(world: str, seed: int) -> MadeSurvey:
     FlowError
         If no flow can be solved on any chip that is drawn.
     """
+    faults = faults_of(world, seed)
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, 0x5EC0, attempt])
         drawn = draw_chip(rng)
@@ -251,10 +251,10 @@ def make_survey(world: str, seed: int) -> MadeSurvey:
         made = SecondWorld(drawn, np.random.default_rng([seed, 0xFA, attempt]), [fine], coarse(fine))
         made.um_per_rev_share *= 1.0 + rng.normal(0.0, 0.02)
         made.heading_rad += np.deg2rad(rng.normal(0.0, 0.3))
-        for fault in faults_of(world, seed):
+        for fault in faults:
             _KINDS[fault][0](made)
         try:
-            return _survey(made, faults_of(world, seed), rng)
+            return _survey(made, faults, rng)
         except FlowError:
             continue
     raise FlowError(f"second worlds: no chip of seed {seed} in world '{world}' can be solved; try another seed")

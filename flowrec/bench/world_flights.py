@@ -282,7 +282,7 @@ def score_field(found: FlowField, judged: Judged) -> dict[str, Any]:
     """
     right, invented = count_causes(found.note, judged.planted)
     said = {"expected": found.error_share, "warned": right > 0, "invented": invented, "note": found.note}
-    said["doubted"] = "nothing it knows explains" in found.note
+    said["doubted"] = found.parameter("unexplained_share") is not None
     if found.std_um_s is not None:
         column, row = np.round(judged.seen_um / found.um_per_px).astype(int).T
         h, w = judged.fluid.shape

@@ -113,13 +113,12 @@ def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> F
 def judge_refinement(
     refined: FlowField | None, config: ResolvedConfig, *, known_doubts: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Facts and doubts about the refined flow of a run, which is not doubted again if the walls' scale is."""
+    """Facts and doubts about the refined flow of a run; its scale is not doubted again if the walls' is."""
     facts: dict[str, str] = {}
     doubts: list[str] = []
     if refined is None:
         return facts, doubts
-    if not known_doubts:
-        doubts += map_doubts(refined, config.camera.um_per_px)
+    doubts += map_doubts(refined, config.camera.um_per_px, scale_known=known_doubts)
     if refined.refused and refined.log_score is None:
         if config.refine.observes_flow:
             doubts.append(f"the flow was not refined: {refined.refused}")

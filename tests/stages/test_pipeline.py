@@ -86,6 +86,20 @@ def test_the_course_that_a_refinement_found_turns_observer_and_coils_and_no_obse
         last = replace(ticks[3], refined=replace(found, parameter_std=np.array([std])))
         return after(pipeline, last, ticks[4:30])
 
+    given_turns = []
+
+    class Watched:
+        """The health monitor, which notes the revolutions that it is given."""
+
+        def watch(self, *given):
+            given_turns.append(given[5].turns)
+            return pipeline.health.watch(*given)
+
+    flown(10.0, pipeline=replace(pipeline, health=Watched()))
+    c, s = np.cos(np.deg2rad(10.0)), np.sin(np.deg2rad(10.0))
+    turned = [np.array([[c, -s], [s, c]]) @ tick.applied.turns for tick in ticks[4:30]]
+    assert np.allclose(given_turns, turned) and np.abs(turned).max() > 0.0
+
     plain, corrected = flown(0.0), flown(10.0)
     before, now = (tick.estimate.rolled_um_s for tick in (plain, corrected))
     assert np.arctan2(before[0] * now[1] - before[1] * now[0], before @ now) == pytest.approx(

@@ -315,9 +315,7 @@ class Assimilate(PriorSettings):
             variance += weight * (one.on_pixels_of(chip.mask, field_variance(one)) + (flow - mean) ** 2)
         also = with_obstacle(findings(every.found, every.weights), chip, every.obstacle)
         departure = find_departure(best)
-        if departure is not None and explained_by_pump(also, departure):
-            departure = None
-        if departure is not None:
+        if departure is not None and not explained_by_pump(also, departure):
             points = np.argwhere(chip.mask)[:, ::-1].astype(np.float64)
             if not (departure.in_time and wanders(also)):  # the bars have grown by the wander already
                 variance = np.maximum(variance, departure.least_variance(points, mean))

@@ -129,7 +129,7 @@ class Observed:
     def moved_by(self, registration: Floats) -> Floats:
         """(n, 2) px by which a registration (4,) moves the observations: offset x and y in px, scale, angle in rad."""
         away = self.away
-        return np.asarray(registration[:2] - registration[2] * away - registration[3] * _quarter_turn(away))
+        return np.asarray(registration[:2] - registration[2] * away - registration[3] * quarter_turn(away))
 
     def at(self, moved: Floats) -> Observed:
         """The observations (n, 2) px from where the stated registration puts them."""
@@ -178,9 +178,9 @@ class Observed:
         rolled, time_s = here.rolled_um_s, here.time_s
         own = np.zeros_like(v) if rolled is None else rolled
         away = self.away
-        turned = _quarter_turn(away)
+        turned = quarter_turn(away)
         stretch = v + own - np.einsum("an,anc->nc", away.T, gradient)
-        turn = _quarter_turn(v) - np.einsum("an,anc->nc", turned.T, gradient)
+        turn = quarter_turn(v) - np.einsum("an,anc->nc", turned.T, gradient)
         known, openings = here.predict(model.known), len(model.chip.openings)
         found = [
             _effect("boundary", BOUNDARY, known[:openings]),
@@ -197,7 +197,7 @@ class Observed:
         if rolled is not None:
             found += [
                 _effect("gain", GAIN, own[None]),
-                _effect("heading", HEADING, _quarter_turn(own)[None]),
+                _effect("heading", HEADING, quarter_turn(own)[None]),
                 _effect("hindrance", self._hindrance_size(), -((self.near - self.near.mean())[:, None] * own)[None]),
             ]
         if time_s is not None:
@@ -208,7 +208,7 @@ class Observed:
                 Effect(f"wander {length:g} s", *WANDER, none, along * np.exp(-apart / length)) for length in WANDER_S
             ]
             if rolled is not None:
-                pushed = [(vectors.ravel()[:, None] * vectors.ravel()) for vectors in (own, _quarter_turn(own))]
+                pushed = [(vectors.ravel()[:, None] * vectors.ravel()) for vectors in (own, quarter_turn(own))]
                 found.append(Effect("rolling", *ROLLING, none, sum(pushed) * np.exp(-apart / ROLLING_S)))
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
@@ -282,6 +282,6 @@ def _effect(name: str, size: tuple[float, float], columns: Floats) -> Effect:
     return Effect(name, *size, np.ascontiguousarray(columns.reshape(len(columns), -1)))
 
 
-def _quarter_turn(vectors: Floats) -> Floats:
+def quarter_turn(vectors: Floats) -> Floats:
     """(n, 2) vectors turned by 90 degrees from +x to +y."""
     return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)

@@ -82,10 +82,10 @@ class Findings:
         return float(self.values[index]), float(self.stds[index])
 
 
-def map_doubts(field: FlowField, um_per_px: float) -> list[str]:
-    """Reasons to doubt a refined field, or the scale with which it was made; none where its causes explain it."""
+def map_doubts(field: FlowField, um_per_px: float, *, scale_known: bool = False) -> list[str]:
+    """Reasons to doubt a refined field, or the scale with which it was made, unless that is known to be wrong."""
     unexplained = [clause.strip() for clause in field.note.split(";") if clause.strip().startswith(UNEXPLAINED)]
-    scale = scale_doubt(field, um_per_px)
+    scale = "" if scale_known else scale_doubt(field, um_per_px)
     return [*([scale] if scale else []), *(f"the refined flow: {clause}" for clause in unexplained)]
 
 
@@ -250,13 +250,11 @@ def wanders(found: Findings) -> bool:
     return any(word.startswith(WANDER) for word in found.words)
 
 
-def with_departure(found: Findings, departure: Departure | None, um_per_px: float) -> Findings:
+def with_departure(found: Findings, departure: Departure, um_per_px: float) -> Findings:
     """Add a departure from all causes. A cause that a departure may have been taken for is not said beside it.
 
     A wander of the flow is said beside a departure in time, which may be the largest part of it.
     """
-    if departure is None:
-        return found
     hidden = tuple(words for words in TAKEN_FOR if not (departure.in_time and words == WANDER))
     x_um, y_um = um_per_px * departure.place_px
     std_um = um_per_px * departure.radius_px
@@ -280,11 +278,11 @@ def _in_time(values: Mapping[str, float], stds: Mapping[str, float], observed_s:
             continue  # what the frequency of the stage leaves of its motion
         by = f"by {with_error(100.0 * share, 100.0 * stds[name])} % at {hz:.2f} Hz"
         slow = hz * observed_s < PERIODS
-        words.append(f"the flow changes {by}, with the pump or by place" if slow else f"the pump pulsates {by}")
+        words.append(f"the flow changes {by}, with the pump or by place" if slow else f"{PULSATION} {by}")
     # A robot that passes each place once can not tell a slow change from one along the way.
     wander, wander_std = (100.0 * of.get("wander_share", 0.0) for of in (values, stds))
     if wander > 100.0 * WANDERS:
-        words.append(f"the flow wanders in time, or by place along the way, by {with_error(wander, wander_std)} %")
+        words.append(f"{WANDER} in time, or by place along the way, by {with_error(wander, wander_std)} %")
     return words
 
 

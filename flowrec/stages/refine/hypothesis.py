@@ -212,9 +212,11 @@ def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
     found = shaking(hz, here.time_s)
     shaken = replace(observed, operator=replace(here, disturbances=(*here.disturbances, found)))
     calmer = robust_noise(shaken)
-    after = first_evidence(shaken, calmer) - outlying(calmer)
-    pump = _evidence(observed, robust, np.zeros_like(base), base, hz).sizes(None).evidence
-    return found if after > max(sizes.evidence + WORTH_A_SHAKE, pump) - outlying(robust) else None
+    after = first_evidence(shaken, calmer) - outlying(calmer) + outlying(robust)
+    if after <= sizes.evidence + WORTH_A_SHAKE:
+        return None
+    pump = _evidence(observed, robust, np.zeros_like(base), base, hz).sizes().evidence
+    return found if after > pump else None
 
 
 def noise_variance(operator: ObservationOperator) -> Floats:

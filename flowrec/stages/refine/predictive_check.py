@@ -23,12 +23,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowrec.core import Floats
+from flowrec.stages.refine.causes import quarter_turn
 from flowrec.stages.refine.evidence import gains_of_trials
 from flowrec.stages.refine.hypothesis import NOISE, HypothesisFit, averages
 
-NATS = (
-    8.0  # gain in ln evidence of a departure that is said: above that of 75 surveys in worlds that the model contains
-)
+# Gain in ln evidence of a departure that is said: above that of 72 surveys in worlds that the model contains.
+NATS = 8.0
 SIZES = (0.1, 0.2, 0.4)  # of a departure, over the flow
 CLIP = 3.5  # standard deviations of the noise
 WIDTH = 0.7  # of a window of place, one standard deviation in channel widths
@@ -51,7 +51,7 @@ class Departure:
     ----------
     nats : gain in ln evidence by it.
     nats_in_time : likewise of the best window of time.
-    along, across : part of the flow, or of the own motion, by which the observations differ from the model.
+    share : part of the flow, or of the own motion, by which the observations differ from the model.
     spread, spread_um_s : root mean square of such parts over all windows, of those in which something was found.
     place_px : (2,) mean of the places in the window.
     radius_px : standard deviation of a window of place.
@@ -61,8 +61,7 @@ class Departure:
 
     nats: float
     nats_in_time: float
-    along: float
-    across: float
+    share: float
     spread: float
     spread_um_s: float
     place_px: Floats
@@ -74,11 +73,6 @@ class Departure:
     def in_time(self) -> bool:
         """True if the window is one of time."""
         return self.nats == self.nats_in_time
-
-    @property
-    def share(self) -> float:
-        """Size of the departure, over the flow."""
-        return float(np.hypot(self.along, self.across))
 
     def least_variance(self, points_px: Floats, flow: Floats) -> Floats:
         """(n, 1) least variance of the components of a flow (n, 2) at points (n, 2)."""
@@ -133,8 +127,7 @@ def find_departure(found: HypothesisFit) -> Departure | None:
             Departure(
                 nats=float(nats[best]),
                 nats_in_time=-np.inf,
-                along=float(parts[1, best, 0]),
-                across=float(parts[1, best, 1]),
+                share=float(np.hypot(*parts[1, best])),
                 spread=float(np.sqrt(square.mean())),
                 spread_um_s=float(np.sqrt((square * power).mean())),
                 place_px=mean @ points,
@@ -153,8 +146,7 @@ def _gains(weights: Floats, vectors: Floats, covariance: Floats, y: Floats) -> t
 
     `y` (2, m) are the observations with clipped residuals, which decide, and as they are.
     """
-    turned = np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
-    columns = (weights[:, None, :, None] * np.stack([vectors, turned])).reshape(len(weights), 2, -1)
+    columns = (weights[:, None, :, None] * np.stack([vectors, quarter_turn(vectors)])).reshape(len(weights), 2, -1)
     inverse = np.linalg.inv(covariance)
     precision = columns @ inverse @ columns.transpose(0, 2, 1) + np.eye(2) / max(SIZES) ** 2
     parts = np.stack([np.linalg.solve(precision, (columns @ (inverse @ one))[..., None])[..., 0] for one in y])

@@ -58,6 +58,7 @@ def test_a_flow_that_no_cause_explains_is_said_where_it_is_and_its_bars_reach_wh
     assert (field.std_um_s[stem] > 1.2 * usual.std_um_s[stem]).any()
     (doubt,) = map_doubts(field, case.chip.um_per_px)
     assert UNEXPLAINED in doubt
+    assert map_doubts(field, case.chip.um_per_px, scale_known=True) == [doubt]  # of the flow, whatever the scale
 
 
 def test_a_wander_of_the_flow_is_no_explanation_and_is_not_said_beside_what_nothing_explains(twin):
