@@ -68,6 +68,12 @@ def test_the_golden_session_of_the_moderate_world_replays_the_same_but_for_what_
     assert done.recorded.mission.outcome == "reached"
 
 
+@pytest.mark.parametrize("path", [GOLDEN, MODERATE])
+def test_what_a_refinement_finds_of_the_robot_corrects_nothing_in_a_session_from_before(path: Path) -> None:
+    refiner = flowrec.open(path).config.refine
+    assert not refiner.correct_robot and not refiner.correct_heading
+
+
 def means_over_pixels(equations: System, flux: NDArray[np.float64]) -> NDArray[np.float64]:
     """The velocity (h, w, 2) in m/s as version 1 of the numerics gave it."""
     grid, padded = equations.grid, np.append(flux, 0.0)
