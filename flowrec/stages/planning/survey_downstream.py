@@ -42,7 +42,8 @@ class Downstream(SurveyWays):
         if start.error:
             return no_route(METHOD, start.error)
         px = space.um_per_px
-        cost, parent = fastest_ways(space, speed_um_s / px, start.node, self.weight(space))
+        weight = self.weight(space)
+        cost, parent = fastest_ways(space, speed_um_s / px, start.node, weight)
         length, work = _along_tree(cost, parent, space)
         allowed = np.isfinite(cost) & (work > 0.0) & self.far_from_openings(space, order.chip).ravel()
         allowed[start.node] = False
@@ -60,7 +61,8 @@ class Downstream(SurveyWays):
             )
         central = central_among(allowed.reshape(space.free.shape), space.clearance)
         end = _most_work(work, central.ravel())
-        route = self.timed_stretch(space, order.field, backtrack(parent, end, space.width), start, speed_um_s)
+        path = backtrack(parent, end, space.width)
+        route = self.timed_stretch(space, order.field, path, start, speed_um_s, weight)
         return with_remarks(route, start.remark) if route.reachable else route
 
 

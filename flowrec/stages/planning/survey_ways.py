@@ -61,13 +61,13 @@ class SurveyWays:
         return far
 
     def timed_stretch(
-        self, space: FreeSpace, field: FlowField, path: Points, start: Endpoint, speed_um_s: float
+        self, space: FreeSpace, field: FlowField, path: Points, start: Endpoint, speed_um_s: float, weight: Raster
     ) -> Route:
-        """The timed route along a path (n, 2) px of nodes, off the pixels where that is possible."""
+        """The timed route along a path (n, 2) px of nodes, off the pixels where `weight` costs less."""
         px = space.um_per_px
         path = with_ends(space, path, start, None)
         rasters = space.cost_rasters(speed_um_s / px)._replace(clearance=space.clearance)
-        for candidate in (refine_path(path, rasters, self.weight(space)), path):
+        for candidate in (refine_path(path, rasters, weight), path):
             route = timed_route(METHOD, field, candidate * px, speed_um_s)
             if route.reachable:
                 break
