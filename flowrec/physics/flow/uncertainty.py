@@ -92,7 +92,6 @@ class FlowUncertainty:
     noise_factor : by which the noise of observations was wider than stated, neighbours that err alike included.
     doubts : what may be wrong in one place; neither `std_um_s` nor `error_share` contains it.
     registration : the most probable one.
-    registration_covariance : (4, 4) of its offset x and y in um, its scale, and its angle in rad.
     """
 
     mean_um_s: Floats
@@ -103,15 +102,6 @@ class FlowUncertainty:
     noise_factor: float = 1.0
     doubts: Doubts = field(default_factory=lambda: Doubts.none(0))
     registration: Registration = field(default_factory=Registration.identity)
-    registration_covariance: Floats = field(default_factory=lambda: np.zeros((4, 4)))
-
-    def placement_std_um(self, on_chip_um: Floats) -> Floats:
-        """(n,) standard deviation of the place of a robot that is believed at places (n, 2), mean of x and y."""
-        x, y = (on_chip_um - self.registration.centre_um).T
-        one, zero = np.ones(len(x)), np.zeros(len(x))
-        moved = np.array([[one, zero, -x, y], [zero, one, -y, -x]])  # as `Registration` moves a place, per unknown
-        variance = np.einsum("dkn,kl,dln->n", moved, self.registration_covariance, moved)
-        return np.asarray(np.sqrt(0.5 * np.maximum(variance, 0.0)))
 
     @property
     def std_um_s(self) -> Floats:

@@ -42,8 +42,7 @@ class Downstream(SurveyWays):
         if start.error:
             return no_route(METHOD, start.error)
         px = space.um_per_px
-        weight = self.weight(space)
-        cost, parent = fastest_ways(space, speed_um_s / px, start.node, weight)
+        cost, parent = fastest_ways(space, speed_um_s / px, start.node, self.weight(space))
         length, work = _along_tree(cost, parent, space)
         allowed = np.isfinite(cost) & (work > 0.0) & self.far_from_openings(space, order.chip).ravel()
         allowed[start.node] = False
@@ -61,8 +60,7 @@ class Downstream(SurveyWays):
             )
         central = central_among(allowed.reshape(space.free.shape), space.clearance)
         end = _most_work(work, central.ravel())
-        path = backtrack(parent, end, space.width)
-        route = self.timed_stretch(space, order.field, path, start, speed_um_s, weight)
+        route = self.timed_stretch(space, order.field, backtrack(parent, end, space.width), start, speed_um_s)
         return with_remarks(route, start.remark) if route.reachable else route
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import Floats, FlowField, Route, cells_at
+from flowrec.core import Floats, FlowField, Route
 from flowrec.physics import FlowUncertainty, fluid_image
 from flowrec.stages.planning.cost_rasters import Mask, Points, Raster
 from flowrec.stages.planning.free_space import FreeSpace
@@ -32,7 +32,6 @@ ENOUGH = "enough"  # the first word of the reason of a survey that is complete
 _SHORTEST_SHARE = 0.05  # of the crossing time: a stretch counts as if it took at least so long
 _SHORTEST_RADII = 2.0  # distance of the end of a stretch from its start
 _PATCH_RADII = 4.0  # about the width of a channel: looks so near to each other share the error of the model
-_OFF_DEVIATIONS = 2.0  # of the robot's place, by which more clearance is wanted
 _KEPT_TO_WAIT = 0.1  # of the robot's speed, where it waits
 
 
@@ -56,7 +55,6 @@ class _Site:
     start: Endpoint
     togo_s: Floats  # (h*w,) s to the goal; inf: not from there
     waiting: Mask  # (h, w) where the robot is faster than the flow
-    weight: Raster  # (h, w) factor on the cost of a pixel
     remark: str
 
 
@@ -122,7 +120,7 @@ class Information(SurveyWays):
         if best is None:
             said = f"{ENOUGH}: the flow is known to {100.0 * now:.1f} %, and no further stretch is worth its time"
             return _so_far(order.present, said)
-        route = self.timed_stretch(site.space, believed, best.path, site.start, best.speed_um_s, site.weight)
+        route = self.timed_stretch(site.space, believed, best.path, site.start, best.speed_um_s)
         if not route.reachable:
             return route
         said = f"from {100.0 * now:.1f} % to {100.0 * best.error:.1f} % of the flow in {route.arrival_s[-1]:.1f} s"
@@ -159,22 +157,8 @@ class Information(SurveyWays):
                 waiting = flow + deviations * deviation <= (1.0 - _KEPT_TO_WAIT) * limit
                 fewer = deviations < self.robust_deviations
                 remark = f"{deviations:g} deviations of the flow to spare" if fewer else ""
-                return _Site(space, order, uncertainty, start, togo, waiting, self._weight(space, uncertainty), remark)
+                return _Site(space, order, uncertainty, start, togo, waiting, remark)
         return None
-
-    def _weight(self, space: FreeSpace, uncertainty: FlowUncertainty) -> Raster:
-        """(h, w) as `weight`, where a wall may be nearer than it is believed to be.
-
-        A clearance is the lesser of those by the registration found and by the stated one, which few observations
-        correct little better than they mislead; wanted is `need` and some deviations of the place.
-        """
-        y, x = np.indices(space.clearance.shape)
-        places_um = space.um_per_px * np.column_stack((x.ravel(), y.ravel())).astype(np.float64)
-        stated = cells_at(uncertainty.registration.to_measured(places_um) / space.um_per_px, space.clearance.shape)
-        near = np.minimum(space.clearance, stated.interpolate(space.clearance).reshape(space.clearance.shape))
-        off = uncertainty.placement_std_um(places_um).reshape(near.shape) / space.um_per_px
-        wanted = space.need + _OFF_DEVIATIONS * off
-        return 1.0 + self.middle_pull * (wanted / np.maximum(near, space.radius)) ** 2
 
     def _need(self, site: _Site) -> Need:
         """The error of the map, and of the flow along the ways to the goal."""
@@ -211,7 +195,7 @@ class Information(SurveyWays):
             shares.append(self.drift_share)
         for share in dict.fromkeys(shares):
             speed_um_s = planning_speed_um_s(share, order.robot)
-            cost, parent = fastest_ways(space, speed_um_s / px, site.start.node, site.weight)
+            cost, parent = fastest_ways(space, speed_um_s / px, site.start.node, self.weight(space))
             reached = allowed & np.isfinite(cost).reshape(allowed.shape)
             for end in _spread(reached, space.clearance, self.places):
                 path = backtrack(parent, end, space.width)

@@ -61,13 +61,13 @@ class SurveyWays:
         return far
 
     def timed_stretch(
-        self, space: FreeSpace, field: FlowField, path: Points, start: Endpoint, speed_um_s: float, weight: Raster
+        self, space: FreeSpace, field: FlowField, path: Points, start: Endpoint, speed_um_s: float
     ) -> Route:
-        """The timed route along a path (n, 2) px of nodes, off the pixels where `weight` costs less."""
+        """The timed route along a path (n, 2) px of nodes, off the pixels where that is possible."""
         px = space.um_per_px
         path = with_ends(space, path, start, None)
         rasters = space.cost_rasters(speed_um_s / px)._replace(clearance=space.clearance)
-        for candidate in (refine_path(path, rasters, weight), path):
+        for candidate in (refine_path(path, rasters, self.weight(space)), path):
             route = timed_route(METHOD, field, candidate * px, speed_um_s)
             if route.reachable:
                 break

@@ -278,12 +278,6 @@ def lines_hz(time_s: Floats | None) -> Floats:
     return np.arange(slowest, fastest, LINE_STEP / span)[:MOST_LINES]
 
 
-def registration_prior(um_per_px: float) -> Floats:
-    """(4, 4) covariance of the registration's offset x and y in um, scale and angle in rad, before observations."""
-    offset_um = OFFSET_PX[0] * um_per_px
-    return np.diag(np.square([offset_um, offset_um, SCALE[0], ANGLE[0]]))
-
-
 def _effect(name: str, size: tuple[float, float], columns: Floats) -> Effect:
     return Effect(name, *size, np.ascontiguousarray(columns.reshape(len(columns), -1)))
 

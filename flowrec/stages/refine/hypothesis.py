@@ -114,12 +114,6 @@ class HypothesisFit:
         return Registration(px * offset, float(scale[0]), float(angle[0]), px * places.mean(axis=0))
 
     @property
-    def registration_covariance(self) -> Floats:
-        """(4, 4) of its offset x and y in um, its scale, and its angle in rad."""
-        units = np.array([self.observed.um_per_px, self.observed.um_per_px, 1.0, 1.0])
-        return self.unknowns("offset", "scale", "angle")[1] * np.outer(units, units)
-
-    @property
     def depth_um(self) -> tuple[float, float]:
         """Depth of the chip and its standard deviation; 0 where the depth is no unknown."""
         prior, stated = self.observed.model.prior, self.observed.model.chip.depth_um

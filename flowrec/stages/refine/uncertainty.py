@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from flowrec.core import Floats, FlowError
-from flowrec.physics import Chip, FlowSolver, FlowUncertainty, Registration
+from flowrec.physics import Chip, FlowSolver, FlowUncertainty
 from flowrec.stages.refine.assimilate import OBSTACLE_SHARE, Assimilate, Hypotheses
-from flowrec.stages.refine.causes import GAIN, registration_prior
+from flowrec.stages.refine.causes import GAIN
 from flowrec.stages.refine.doubts import doubted_places
 from flowrec.stages.refine.field_variance import field_columns, left_variance, prior_left_variance, prior_of
 from flowrec.stages.refine.flow_model import flow_model
@@ -33,9 +33,7 @@ def flow_uncertainty(
             rolled = np.ones((1, len(model.base)))
             left = _error_std(prior_left_variance(model))
             return FlowUncertainty(
-                *(model.base, columns, rolled, _block_diagonal(covariance, np.diag([GAIN[0] ** 2])), left),
-                registration=replace(Registration.identity(), centre_um=0.5 * np.array(chip.size_um)),
-                registration_covariance=registration_prior(chip.um_per_px),
+                model.base, columns, rolled, _block_diagonal(covariance, np.diag([GAIN[0] ** 2])), left
             )
         operator = settings.with_shaking(operator, chip, solver)
         every = settings.hypotheses(operator, chip, solver)
@@ -68,11 +66,7 @@ def _of(every: Hypotheses) -> FlowUncertainty:
     rolled = np.ones((0 if gain is None else 1, len(mean)))
     factor = best.robust.factor * best.size(NOISE[0])
     left = _error_std(best.on_pixels_of(every.mask, left_variance(best)))
-    return FlowUncertainty(
-        *(mean, columns, rolled, covariance, left, factor),
-        registration=best.registration,
-        registration_covariance=best.registration_covariance,
-    )
+    return FlowUncertainty(mean, columns, rolled, covariance, left, factor, registration=best.registration)
 
 
 def _error_std(variance: Floats) -> Floats:

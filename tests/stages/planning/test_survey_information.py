@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from flowrec.core.interpolation import nearest_pixels
 from flowrec.core.messages import Observations
@@ -51,11 +50,6 @@ def unknown(chip, field, seen=(1.0, 1.0), rolled=None):
 def ordered(chip, field, uncertainty, start=STEM, goal=UPPER, **more):
     sampling = Sampling(spacing_um=20.0, interval_s=0.0, noise_um_s=2.0)
     return SurveyOrder(field, np.array(start), chip, robot(SPEED_UM_S), np.array(goal), uncertainty, sampling, **more)
-
-
-def walls_um(chip):
-    """(h, w) distance of the pixels to the nearest wall."""
-    return PX * ndimage.distance_transform_edt(np.pad(chip.mask, 1))[1:-1, 1:-1]
 
 
 def planner(**settings):
@@ -252,43 +246,9 @@ def test_where_the_image_is_off_the_stretch_runs_where_the_camera_shows_the_chan
     straight = two_stretches(Registration.identity(), np.copy)
     first, second = two_stretches(off, off.to_measured)
     for moved, still in zip((first, second), straight, strict=True):
-        on_chip = off.on_chip(moved.waypoints_um)
-        np.testing.assert_allclose(on_chip[0], still.waypoints_um[0], atol=1e-6)
-        # The stated registration counts for the ways, so the best end may be another place of the same channel.
-        np.testing.assert_allclose(on_chip[-1], still.waypoints_um[-1], atol=6.0 * PX)
-        row, column = nearest_pixels(on_chip / PX, chip.mask.shape)
-        assert walls_um(chip)[row, column].min() > robot(SPEED_UM_S).radius_um
-    np.testing.assert_allclose(second.stretches[:, :2], straight[1].stretches[:, :2], rtol=0.1)  # errors
+        np.testing.assert_allclose(off.on_chip(moved.waypoints_um)[[0, -1]], still.waypoints_um[[0, -1]], atol=1e-6)
+    np.testing.assert_allclose(second.stretches, straight[1].stretches, rtol=1e-3)
     np.testing.assert_array_equal(second.waypoints_um[: len(first.waypoints_um)], first.waypoints_um)
-
-
-def test_where_the_place_of_the_image_is_uncertain_the_stretch_cuts_no_corner():
-    chip, field = junction()
-    doubt = unknown(chip, field, (0.3, 1e-3))
-
-    def room_um(**known):
-        route = planner().plan(ordered(chip, field, replace(doubt, **known)))
-        row, column = nearest_pixels(route.waypoints_um / PX, chip.mask.shape)
-        turned = (np.abs(column - 44) < 8) & (row < 40)  # into the branch
-        return walls_um(chip)[row, column][turned].min()
-
-    known = room_um()
-    off = Registration(np.array([0.0, 9.0]), 0.0, 0.0, np.array([700.0, 400.0]))
-    assert room_um(registration_covariance=np.diag([30.0**2, 30.0**2, 0.0, 0.0])) > known + 0.5 * PX, "known to 30 um"
-    assert room_um(registration=off) > known - PX, "found and stated differ"
-
-
-def test_a_place_is_as_uncertain_as_the_registration_makes_it():
-    rng = np.random.default_rng(1)
-    flow, field = junction()
-    spread = rng.normal(size=(4, 4)) * np.array([8.0, 8.0, 0.01, 0.02])[:, None]
-    drawn = rng.normal(size=(20_000, 4)) @ spread.T
-    places = np.array([[700.0, 400.0], [1300.0, 150.0], [100.0, 445.0]])
-    moved = np.array([Registration(one[:2], one[2], one[3], places[0]).on_chip(places) for one in drawn])
-    believed = Registration(np.zeros(2), 0.0, 0.0, places[0])
-    known = replace(unknown(flow, field), registration=believed, registration_covariance=spread @ spread.T)
-    scatter = np.sqrt(0.5 * moved.var(axis=0).sum(axis=1))
-    np.testing.assert_allclose(known.placement_std_um(places), scatter, rtol=0.02)
 
 
 def doubted(chip, field, *columns, probability=0.15):
