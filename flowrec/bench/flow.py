@@ -44,7 +44,7 @@ from flowrec.core import (
     say,
 )
 from flowrec.physics import FlowSolver, clear_cache, read_vessel_case, relative_rmse
-from flowrec.stages import REFINERS, PiUnet, Refiner, Trimmed, with_row
+from flowrec.stages import REFINERS, Device, PiUnet, Refiner, Trimmed, with_row
 
 RANDOM_CASES = 10
 
@@ -70,6 +70,7 @@ class Scenario:
     # grown, shrunk: walls one pixel off everywhere; shifted: one pixel to the right; otsu, adaptive: from a picture
     mask: str = "right"
     observations: str = "raw"  # trimmed: outliers removed as in the paper
+    device: Device = "cpu"  # of the methods that have a network
 
     def observe(self, case: Path) -> Observations:
         """The observations of a case. Outliers differ between cases and are the same for every method."""
@@ -92,6 +93,7 @@ def measure(
     observations: Annotated[
         Literal["raw", "trimmed"], typer.Option(help="trimmed: outliers are removed as in the paper.")
     ] = "raw",
+    device: Annotated[Device, typer.Option(help="Where the networks are fitted.")] = "cpu",
     fields: Annotated[Path | None, typer.Option(metavar="DIR", help="Write every field into this folder.")] = None,
     figure: FigureFile = None,
     case: Annotated[
@@ -110,7 +112,7 @@ def measure(
         If no case can be refined.
     """
     names = choose_names("bench flow: no method", methods, METHODS)
-    scenario = Scenario(noise, share, k, outliers, mask, observations)
+    scenario = Scenario(noise, share, k, outliers, mask, observations, device)
     rows: list[dict[str, Any]] = []
     left_out: dict[str, str] = {}
     with ExitStack() as stack:
@@ -163,12 +165,13 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
 
     `rmse_*` are relative RMSE over the fluid pixels of the true mask. `seconds` and `cpu_seconds` include the first
     solution of the flow; `seconds_update` is the time for other observations of the same case, with filled caches.
-    `within_2_std`, `stated_over_true` and `crps` are those of `flow_scores`, `peak_mb` the peak memory of this process.
+    `within_2_std`, `stated_over_true` and `crps` are those of `flow_scores`; `peak_mb` and `gpu_mb` are the peak memory
+    of this process and of what it has on a GPU.
     """
     chip = read_vessel_case(case)
     observations = scenario.observe(case)
     assumed_chip = with_mask_error(chip, scenario.mask)
-    solver, refiner = FlowSolver(scenario.k), METHODS[method]
+    solver, refiner = FlowSolver(scenario.k), _on_device(METHODS[method], scenario.device)
     clear_cache()
     began, began_cpu = time.perf_counter(), time.process_time()
     assumed = solver.solve(assumed_chip)
@@ -196,8 +199,26 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
         "stated_over_true": scores["stated_over_true"],
         "crps": scores["crps"],
         "peak_mb": peak_mb(),
+        "gpu_mb": _gpu_mb(scenario.device),
         "note": field.note,
     }
+
+
+def _on_device(method: Refiner | NullModel, device: Device) -> Refiner | NullModel:
+    """The method with its network on a device; one without network is the same."""
+    if isinstance(method, NullModel) or device == "cpu":
+        return method
+    fitted = {name: getattr(method, name) for name in ("pi_unet", "ni", "pinn", "unet")}
+    return replace(method, **{name: replace(settings, device=device) for name, settings in fitted.items()})
+
+
+def _gpu_mb(device: Device) -> float:
+    """Peak memory of the GPU that this process has allocated, MB; 0 without a GPU."""
+    if device == "cpu":
+        return 0.0
+    import torch
+
+    return torch.cuda.max_memory_allocated() / 1e6
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:

@@ -129,6 +129,8 @@ def _declared_fields(message_type: type) -> Iterator[MessageField]:
                 optional = True
         shape = next((note for note in notes if isinstance(note, Shape)), None)
         dtype = None
+        if alias := getattr(typing.get_origin(kind), "__value__", None):
+            kind = alias[typing.get_args(kind)]  # NDArray[...] of numpy 2.5, a `type` statement
         if typing.get_origin(kind) is np.ndarray:
             scalar = typing.get_args(typing.get_args(kind)[1])[0]
             dtype = np.dtype(next(iter(typing.get_args(scalar)), scalar))  # of several the first

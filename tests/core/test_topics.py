@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, make_dataclass
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
+import numpy as np
 import pytest
+from typing_extensions import TypeAliasType
 
-from flowrec.core.declarations import Message, Role, SlowStage, Source, Topic, Vector
+from flowrec.core.declarations import Message, Role, Shape, SlowStage, Source, Topic, Vector, message_fields
 from flowrec.core.enums import WorkOrder
 from flowrec.core.messages import Track
 from flowrec.core.topics import BY_FIELD, WORKER_FIELDS, Tick, stale_results, topics_of
@@ -20,6 +22,21 @@ class Unshaped(Message):
 
     stamp_ns: int
     points_um: Vector
+
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+Alias = TypeAliasType("Alias", np.ndarray[tuple[Any, ...], np.dtype[Scalar]], type_params=(Scalar,))
+
+
+def test_an_array_may_be_declared_by_an_alias_of_a_type_statement_as_numpy_does_since_2_5():
+    image = Annotated[Alias[np.uint8 | np.uint16], "array", Shape(("h", "w")), "grey levels"]
+    (field,) = message_fields(make_dataclass("Aliased", [("image", image)], bases=(Message,)))
+    assert (field.kind, field.dtype, field.shape, field.meaning) == (
+        "array",
+        np.dtype(np.uint8),
+        Shape(("h", "w")),
+        "grey levels",
+    )
 
 
 def tick_with(**changed: Any) -> type:
