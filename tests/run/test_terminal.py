@@ -11,6 +11,7 @@ import sys
 import termios
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -30,7 +31,9 @@ class Command:
         self.out, self.keys, self.inner = out, outer, inner
         self.before = termios.tcgetattr(self.keys)
         self.said, self.frozen, self.reads, self.status = b"", False, True, None
-        self.pid = os.fork()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: other threads run
+            self.pid = os.fork()
         if self.pid == 0:  # only what is safe after a fork, then another program
             signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
             _login_tty(inner)
