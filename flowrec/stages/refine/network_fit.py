@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
     from flowrec.stages.refine.network_inputs import NetworkInputs
 
+# On an H100, vessels of 128 x 128 pixels: each method gives the same bytes twice, in 40 to 130 MB. ni and the printed
+# pi_unet take 0.3 to 0.4 of the time of one CPU core; pi_unet as shipped 0.9 to 1.0 (it is balanced on the CPU), unet
+# 0.1 s on either, pinn 1.2 times it. Fields of two devices differ, by 1e-5 (unet) to a tenth (ni): verify on the same.
 Device = Literal["cpu", "cuda"]
 Iterations = Annotated[int, Range(1, 1_000_000)]
 
