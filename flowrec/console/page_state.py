@@ -12,11 +12,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Phase, Tick, printable, seconds, shift_px
+from flowrec.core import Floats, Phase, Tick, printable, seconds, shift_px
 from flowrec.store import ChipCamera
-from flowrec.view import Batch, Scene, encode_jpeg, state_text
+from flowrec.view import Batch, Scene, encode_jpeg, goal_of, state_text, way_of
 
 # What the page shows depends on these fields of a tick.
 SHOWN = ("frame", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing", "losses")
@@ -63,8 +62,7 @@ class PageState:
     def drawing(self) -> Drawing:
         """Content that changes rarely: walls, route, goal; and the sizes."""
         width, height = self._camera.size_px
-        route, mission = self.tick.route, self.tick.mission
-        goal = mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
+        goal = goal_of(self.tick.mission)
         return {
             "width": width,
             "height": height,
@@ -72,7 +70,7 @@ class PageState:
             "radius": round(self._scene.length_px(self._scene.robot.radius_um), 2),
             "top_speed": self._scene.robot.max_speed_um_s,
             "walls": [self._pixels(line) for line in self._walls_um],
-            "route": self._pixels(route.waypoints_um) if route is not None and route.reachable else [],
+            "route": self._pixels(way_of(self.tick.route)),
             "goal": None if goal is None else self._pixels(goal[None])[0],
             "goal_um": None if goal is None else [round(each) for each in goal.tolist()],
         }
@@ -115,12 +113,12 @@ class PageState:
             counts |= {"driver": losses.driver, "too late": losses.backlog}
         return [printable(f"{count} {what}") for what, count in counts.items() if count]
 
-    def _pixels(self, points_um: NDArray[np.float64]) -> list[list[float]]:
+    def _pixels(self, points_um: Floats) -> list[list[float]]:
         found: list[list[float]] = np.round(self._image.to_px(np.asarray(points_um, np.float64)), 1).tolist()
         return found
 
 
-def _outlines(scene: Scene) -> list[NDArray[np.float64]]:
+def _outlines(scene: Scene) -> list[Floats]:
     """The walls (n, 2) in um: outlines of the fluid, which go on beyond the mask at its openings."""
     padded = np.pad(scene.chip.mask.astype(np.uint8), _EDGE_PX, mode="edge")
     found, _ = cv2.findContours(padded, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)

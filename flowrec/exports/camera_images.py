@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from flowrec.core import Applied, Frame, Image, SessionError, Tick, printable, seconds, without_none
+from flowrec.exports.formats import TimeProgress
 from flowrec.movies import MovieNotes
 from flowrec.store import Session
 
@@ -21,7 +22,7 @@ _DARKEST, _BRIGHTEST = 0.1, 99.9  # percentiles of grey levels that become black
 _OF_CAMERA = ("um_per_px", "angle_deg", "mirror", "centre_um", "exposure_s")  # settings that the images do not tell
 
 
-def with_images(session: Session, progress: Callable[[float], None] = lambda _: None) -> Iterator[tuple[Tick, Frame]]:
+def with_images(session: Session, progress: TimeProgress = lambda _: None) -> Iterator[tuple[Tick, Frame]]:
     """Ticks with a new image of the camera. Where the camera gave none, or the last one again, there is no row.
 
     `progress` takes the session time in s since the first tick, of each image that was taken.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from flowrec.core import DOUBTS, RRD, SessionError
+from flowrec.exports.formats import TimeProgress
 from flowrec.physics import Chip
 from flowrec.stages import ResolvedConfig, calibration_of
 from flowrec.store import Session, files_of
@@ -59,7 +59,7 @@ class RrdExport:
             raise SessionError(f"{second.path}: has another chip or camera than {first.path}; view them one by one")
         return cls(second)
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         scene = replace(
             scene_of(session.config, session.chip, session.path),
             key=session.key,

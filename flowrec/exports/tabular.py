@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from flowrec.core import SessionError, __version__, seconds, summary_of
+from flowrec.exports.formats import TimeProgress
 from flowrec.store import Session, field_values, observed_flow
 
 _RUN = "^[=+\\-@\t\r'＝＋－＠]"  # what a text begins with that a spreadsheet may take for a formula
@@ -54,7 +55,7 @@ class _Tables:
         """The columns that the format holds."""
         return table
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         known = session.reader.topics
         topics = [topic.field for topic in known.topics if session.topics.get(topic.path)]
         if not topics:

@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import NS_PER_S
+from flowrec.core import NS_PER_S, Floats
 from flowrec.view.colours import SOLID, Rgb
 
 Picture = NDArray[np.uint8]
-Points = NDArray[np.float64]
 SUBPIXEL_BITS = 4  # coordinates of OpenCV's lines are given in 1/16 px
 _RIM = 0.75  # opacity of the rim
 _TRAIL_S = 4.0
@@ -23,8 +22,8 @@ _FAR_PX = 1e5  # beyond it nothing is drawn
 _HEAD = 0.45  # length of an arrow's head over that of the arrow
 _HEAD_PX = (2.5, 6.0)  # least and largest, in widths of its line
 _ANGLE = np.linspace(0.0, 2.0 * np.pi, 33)
-CIRCLE: Points = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
-CROSS: tuple[Points, Points] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
+CIRCLE: Floats = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
+CROSS: tuple[Floats, Floats] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
 class Trail:
@@ -32,9 +31,9 @@ class Trail:
 
     def __init__(self, step_px: float) -> None:
         self._step_px = step_px
-        self._points: deque[tuple[int, Points]] = deque()
+        self._points: deque[tuple[int, Floats]] = deque()
 
-    def add(self, stamp_ns: int, point: Points) -> list[Points]:
+    def add(self, stamp_ns: int, point: Floats) -> list[Floats]:
         """The points of the trail after another one (2,)."""
         kept = self._points
         if not kept or math.dist(kept[-1][1], point) >= self._step_px:
@@ -55,7 +54,7 @@ class Layer:
     def __init__(self, shape: tuple[int, int]) -> None:
         self._ink = np.zeros((*shape, 4), np.float32)  # BGR times opacity, and opacity
 
-    def lines(self, lines: Iterable[Points], heads: Iterable[Points], colour: Rgb, width_px: float) -> None:
+    def lines(self, lines: Iterable[Floats], heads: Iterable[Floats], colour: Rgb, width_px: float) -> None:
         """Polylines, each (n, 2) as x, y, and polygons that are filled."""
         polylines = [to_fixed_point(each) for each in lines if drawable(each)]
         polygons = [to_fixed_point(each) for each in heads]
@@ -88,7 +87,7 @@ class Layer:
         ink[inked] = ink[inked] * (1.0 - alpha) + alpha * np.array([*bgr(colour), 1.0], np.float32)
 
 
-def arrows(begins: Points, ends: Points, width_px: float) -> tuple[list[Points], list[Points]]:
+def arrows(begins: Floats, ends: Floats, width_px: float) -> tuple[list[Floats], list[Floats]]:
     """Shafts and heads, for `Layer.lines`, of arrows from `begins` to `ends`, both (n, 2)."""
     shafts, heads = [], []
     for begin, end in zip(begins, ends, strict=True):
@@ -104,7 +103,7 @@ def arrows(begins: Points, ends: Points, width_px: float) -> tuple[list[Points],
     return shafts, heads
 
 
-def draw_outline(picture: Picture, line: Points, colour: Rgb, width_px: float) -> None:
+def draw_outline(picture: Picture, line: Floats, colour: Rgb, width_px: float) -> None:
     """A polyline (n, 2) that is drawn for one image only."""
     for shade, rim in ((SOLID, 1.0), (colour, 0.0)):
         width = max(round(width_px + rim), 1)
@@ -121,7 +120,7 @@ def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, co
     return int(mask.shape[1])
 
 
-def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) -> None:
+def restore(picture: Picture, clean: Picture, centre: Floats, radius_px: float) -> None:
     """Put the pixels of `clean` back within a circle."""
     mask = np.zeros(picture.shape[:2], np.uint8)
     x, y, radius = np.rint(np.array([*centre, radius_px]) * (1 << SUBPIXEL_BITS)).astype(int).tolist()
@@ -129,7 +128,7 @@ def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) 
     cv2.copyTo(clean, mask, picture)
 
 
-def to_fixed_point(points: Points) -> NDArray[np.int32]:
+def to_fixed_point(points: Floats) -> NDArray[np.int32]:
     """Points (n, 2) in 1/16 px, as OpenCV takes them."""
     return np.rint(points * (1 << SUBPIXEL_BITS)).astype(np.int32).reshape(-1, 1, 2)
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import rerun as rr
 
-from flowrec.core import FlowField, Route, Tick
+from flowrec.core import Floats, FlowField, Route, Tick
 from flowrec.view import colours, flow_values, maps
 from flowrec.view import entities as e
 from flowrec.view.entities import EntityLogger, label, points
 from flowrec.view.scene import Scene
 
+_MAPS = {"assumed": e.ASSUMED, "refined": e.REFINED, "true_field": e.TRUE}  # of speed, by field of a tick
 _ARROW_POINTS = 1.6  # half the width of the shaft; Rerun draws a head in proportion
 
 
@@ -44,15 +46,10 @@ class FlowLogger:
 
     def log_fields(self, tick: Tick, last: Tick) -> None:
         """Log the maps of new fields, and all maps when their scale has changed."""
-        fields = {
-            e.ASSUMED: (tick.assumed, last.assumed),
-            e.REFINED: (tick.refined, last.refined),
-            e.TRUE: (tick.true_field, last.true_field),
-        }
-        known = {entity: field for entity, (field, _) in fields.items() if field is not None}
-        new = [entity for entity, field in known.items() if field is not fields[entity][1]]
-        for entity in new:
-            self._speeds.include(flow_values.peak(known[entity]))
+        known: dict[str, Any] = tick.news(Tick(), _MAPS)
+        new = tick.news(last, _MAPS).keys()
+        for name in new:
+            self._speeds.include(flow_values.peak(known[name]))
         scale = self._speeds.scale
         repaint = self._painted is not scale
         if scale is None or not known or not (new or repaint):
@@ -60,21 +57,20 @@ class FlowLogger:
         self._painted = scale
         if repaint:
             self._log_scale(e.SPEED_SCALE, scale)
-        for entity, field in known.items():
-            if repaint or entity in new:
-                self._log(entity, maps.encode_png(scale.paint(flow_values.speed(field, self._mask))))
-        if tick.assumed is not None and tick.refined is not None and {e.ASSUMED, e.REFINED} & set(new):
+        for name in known if repaint else new:
+            self._log(_MAPS[name], maps.encode_png(scale.paint(flow_values.speed(known[name], self._mask))))
+        if tick.assumed is not None and tick.refined is not None and new & {"assumed", "refined"}:
             self._log_map(e.CHANGE, "change", flow_values.change(tick.refined, tick.assumed, self._mask))
         best = tick.field
         if best is None:
             return
-        best_is_new = (e.ASSUMED if tick.refined is None else e.REFINED) in new
+        best_is_new = ("assumed" if tick.refined is None else "refined") in new
         if best_is_new and best.std_um_s is not None:
             self._log_map(e.UNCERTAINTY, "uncertainty", flow_values.uncertainty(best, self._mask))
         if best_is_new or repaint:
             self._log_arrows(best, scale)
 
-    def _log_map(self, entity: str, table: colours.Table, values: flow_values.Floats) -> None:
+    def _log_map(self, entity: str, table: colours.Table, values: Floats) -> None:
         """A map with a scale of its own."""
         scale = flow_values.scale_of(values, table)
         self._log(entity, maps.encode_png(scale.paint(values)))

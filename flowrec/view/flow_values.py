@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowField
+from flowrec.core import Bools, Floats, FlowField
 from flowrec.physics import sample
 from flowrec.view.colours import ColourScale, Table
 from flowrec.view.scene import Scene
 
-Floats = NDArray[np.float64]
 # Lengths in arrow spacings, unless stated otherwise.
 _ARROWS_ACROSS_IMAGE = (28.0, 45.0)  # along its width: for wide channels, and for narrow ones
 ARROWS_ACROSS_VIEW = (16.0, 21.0)  # the same in a view with other panels beside it
@@ -22,7 +20,7 @@ _WELL_AWAY = 0.45  # from the wall
 _PITCH = 0.2  # of the points that may carry an arrow
 
 
-def speed(field: FlowField, mask: NDArray[np.bool_]) -> Floats:
+def speed(field: FlowField, mask: Bools) -> Floats:
     """(h, w) um/s, NaN in solid."""
     return np.where(mask, np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]), np.nan)
 
@@ -32,13 +30,13 @@ def peak(field: FlowField) -> float:
     return float(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]).max())
 
 
-def uncertainty(field: FlowField, mask: NDArray[np.bool_]) -> Floats:
+def uncertainty(field: FlowField, mask: Bools) -> Floats:
     """(h, w) one standard deviation of the velocity vector, um/s, NaN in solid."""
     assert field.std_um_s is not None
     return np.where(mask, np.hypot(field.std_um_s[..., 0], field.std_um_s[..., 1]), np.nan)
 
 
-def change(refined: FlowField, assumed: FlowField, mask: NDArray[np.bool_]) -> Floats:
+def change(refined: FlowField, assumed: FlowField, mask: Bools) -> Floats:
     """(h, w) speed of the refined flow minus that of the assumed one, um/s, NaN in solid."""
     return speed(refined, mask) - speed(assumed, mask)
 

@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from flowrec.core import Matrix
+from flowrec.core import Bools, Matrix
 from flowrec.view import colours
 from flowrec.view.colours import ColourScale
 from flowrec.view.entities import points
@@ -29,7 +29,7 @@ class SpeedScale:
             self.scale = ColourScale.up_to(peak_um_s, "speed")
 
 
-def wave_fronts(time_s: NDArray[np.float32], mask: NDArray[np.bool_], scale: ColourScale) -> rr.EncodedImage:
+def wave_fronts(time_s: NDArray[np.float32], mask: Bools, scale: ColourScale) -> rr.EncodedImage:
     """A time to go (h, w) with darker isochrones, two for each tick; red where the goal can not be reached."""
     known = mask & np.isfinite(time_s)
     pixels = scale.paint(np.where(known, time_s, np.nan))

@@ -14,10 +14,10 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
-from flowrec.core import Estimate, Mission, printable, seconds
+from flowrec.core import Estimate, Floats, Mission, printable, seconds
 from flowrec.view import colours
 from flowrec.view.colours import Rgb, round_below
-from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, Points, arrows, bgr, draw_mask
+from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, arrows, bgr, draw_mask
 
 ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
 _TEXT, _GROUND = colours.WHITE, (24, 24, 28)
@@ -97,8 +97,8 @@ class StatusBar:
         sign_px: float,
         words: str,
         colour: Rgb,
-        lines: Sequence[Points],
-        heads: Sequence[Points] = (),
+        lines: Sequence[Floats],
+        heads: Sequence[Floats] = (),
         width: float = 1.0,
     ) -> Picture:
         """A sign of some px in the given colour, by `Layer.lines`, with its words to the right of it."""

@@ -6,15 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import seconds
+from flowrec.core import Floats, seconds
 
 BUCKETS = 600  # of 0.3 mm in the widest figure
 _MOST_SPANS = 200
 _GAP = 4.0  # of the usual interval of values: a longer one interrupts the line
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

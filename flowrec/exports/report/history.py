@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     CameraLosses,
@@ -17,7 +15,7 @@ from flowrec.core import (
     Drops,
     Estimate,
     Event,
-    FlowField,
+    Floats,
     Health,
     Mission,
     OperatorEvent,
@@ -28,6 +26,7 @@ from flowrec.core import (
     printable,
     seconds,
 )
+from flowrec.exports.formats import TimeProgress
 from flowrec.exports.report.curves import Curve, CurveBuilder, SpanBuilder
 from flowrec.physics import sample
 from flowrec.store import Session
@@ -67,7 +66,7 @@ class History:
     - x_um, y_um: the robot's estimated position; speed_um_s: over ground; demand_um_s: demanded of it through the fluid
     - error_um: distance to where it should be; estimate_error_um: of the estimate to the true position
     - flow_x_um_s, flow_y_um_s: flow at the robot by the observer; flow_std_um_s: one standard deviation per component
-    - map_x_um_s, map_y_um_s: the best map of that time at the robot; map_std_um_s: its standard deviation
+    - map_x_um_s, map_y_um_s: the best map of that time at the robot
     - true_x_um_s, true_y_um_s: true flow at the robot
     - nis: mean normalised innovation squared
     - tick_ms, queue_mb, dropped: time per tick, data that waits for the disk, images dropped so far
@@ -97,10 +96,10 @@ class History:
         self.alarms: dict[str, SpanBuilder] = {}
         self._builders: dict[str, CurveBuilder] = {}
         self.found = False
-        self._position: tuple[int, NDArray[np.float64]] | None = None
+        self._position: tuple[int, Floats] | None = None
 
     @classmethod
-    def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> History:
+    def of(cls, session: Session, progress: TimeProgress = lambda _: None) -> History:
         """Read a session; `progress` takes the session time in s since the first tick.
 
         Raises
@@ -211,7 +210,6 @@ class History:
         if tick.field is not None:
             on_map = sample(tick.field, position_um)
             self._put(stamp_ns, map_x_um_s=on_map[0], map_y_um_s=on_map[1])
-            self._put(stamp_ns, map_std_um_s=float(std_at(tick.field, position_um)))
         if tick.truth is not None and tick.truth.stamp_ns == stamp_ns:
             self._put(stamp_ns, estimate_error_um=math.dist(position_um, tick.truth.position_um))
 
@@ -228,19 +226,3 @@ class History:
 def _name(text: str) -> str:
     """A word of a file for a figure, whatever it holds."""
     return printable(text)[:_LONGEST_NAME]
-
-
-def std_at(field: FlowField, points_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """One standard deviation of the velocity vector of a map at points (..., 2), um/s: of the nearest pixel.
-
-    NaN where the map states none, and outside of the mask's image.
-    """
-    points = np.asarray(points_um, np.float64)
-    if field.std_um_s is None:
-        return np.full(points.shape[:-1], np.nan)
-    height, width = field.std_um_s.shape[:2]
-    column, row = np.moveaxis(np.rint(points / field.um_per_px), -1, 0)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    at = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
-    std = np.hypot(field.std_um_s[..., 0][at], field.std_um_s[..., 1][at])
-    return np.where(inside, std, np.nan)

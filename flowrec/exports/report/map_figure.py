@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowField
+from flowrec.core import Bools, Floats, FlowField
 from flowrec.exports.report import style
 from flowrec.exports.report.path_figure import scale_bar
 from flowrec.exports.report.report_data import ReportData
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-Floats = NDArray[np.float64]
 NOT_KNOWN = 0.25  # standard deviation over the typical speed, above which the flow counts as not known
 _MARGIN_PX = 3
 _BAR_MM = 15.0  # for a colour bar with its numbers
@@ -35,23 +33,23 @@ class Panel:
     title: str
     values: Floats
     scale: ColourScale
-    hatched: NDArray[np.bool_] | None = None
+    hatched: Bools | None = None
 
 
-def typical_speed(field: FlowField, mask: NDArray[np.bool_]) -> float:
+def typical_speed(field: FlowField, mask: Bools) -> float:
     """Root mean square of the speed over the fluid, um/s."""
     found = speed(field, mask)[mask]
     return float(np.sqrt((found**2).mean())) if found.size else 0.0
 
 
-def not_known(field: FlowField, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def not_known(field: FlowField, mask: Bools) -> Bools:
     """(h, w) fluid where one standard deviation exceeds NOT_KNOWN of the typical speed; all where none is stated."""
     if field.std_um_s is None:
         return mask
     return mask & (uncertainty(field, mask) > NOT_KNOWN * typical_speed(field, mask))
 
 
-def known_text(field: FlowField, mask: NDArray[np.bool_], name: str) -> str:
+def known_text(field: FlowField, mask: Bools, name: str) -> str:
     """Description of the standard deviation of a map, in one or two sentences."""
     if field.std_um_s is None:
         return f"The method of the {name} map ({field.method}) states no standard deviation."
@@ -140,7 +138,7 @@ def _panels(data: ReportData) -> list[Panel]:
     return [*panels, Panel("true", speed(data.truth, mask), scale)] if data.truth is not None else panels
 
 
-def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: NDArray[np.bool_]) -> list[Panel]:
+def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: Bools) -> list[Panel]:
     """The speed of one or two fields, their change, and the deviation that the last one states."""
     known = {name: field for name, field in named.items() if field is not None}
     panels = [Panel(name, speed(field, mask), scale) for name, field in known.items()]

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Observations, Phase
+from flowrec.core import Floats, Observations, Phase
 from flowrec.exports.report import style
 from flowrec.exports.report.curves import Curve
 from flowrec.exports.report.history import History
@@ -97,7 +96,7 @@ def shown_observations(data: ReportData) -> tuple[Observations | None, str]:
 
 
 def observation_points(
-    ax: Axes, observations: Observations, observed: NDArray[np.float64], ms: float, zorder: float | None = None
+    ax: Axes, observations: Observations, observed: Floats, ms: float, zorder: float | None = None
 ) -> None:
     """Observations of `shown_observations` as points with one standard deviation."""
     assert observations.time_s is not None, "those without times are not shown"
