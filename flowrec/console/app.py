@@ -146,7 +146,7 @@ class _Commands:
                 raise ValueError("too many at once; wait a second")
             self._given_s.append(now_s)
         if name == GOAL:
-            x_um, y_um = self._board.chip_um(*_finite(asked["x_px"], asked["y_px"]))
+            x_um, y_um = self._board.page_state.chip_um(*_finite(asked["x_px"], asked["y_px"]))
             return {"command": name, "x_um": x_um, "y_um": y_um}
         if name == SPEED:
             limit = asked["limit_um_s"]

@@ -32,7 +32,6 @@ from flowrec.view.camera_pictures import WindowCompleter, encode_jpeg
 from flowrec.view.columns import ColumnBuffer
 from flowrec.view.drawing import CIRCLE, CROSS, Trail
 from flowrec.view.entities import EntityLogger, label, points
-from flowrec.view.flow_logger import FlowLogger
 from flowrec.view.scene import Scene, goal_of, place_on_chip, way_of
 from flowrec.view.state_logger import StateLogger
 
@@ -53,7 +52,6 @@ class TickLogger:
 
     Parameters
     ----------
-    images : whether the camera's images are logged.
     speeds : scale of the maps; loggers that share it paint their maps alike.
     columns : see EntityLogger.
 
@@ -70,7 +68,6 @@ class TickLogger:
         scene: Scene,
         prefix: str = "",
         *,
-        images: bool = True,
         speeds: maps.SpeedScale | None = None,
         columns: ColumnBuffer | None = None,
     ) -> None:
@@ -80,10 +77,9 @@ class TickLogger:
         self._log, self._row, self._scalars = self._entities.log, self._entities.row, self._entities.scalars
         self.present = self._entities.present
         self._style = self._entities.style
-        self._images = images
         self._windows = WindowCompleter()
         self._placed_step = 0
-        self._flow = FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds)
+        self._flow = maps.FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds)
         self._tick = self._last = Tick()
         left, _, right, _ = scene.image_bounds()
         self._unit_px = (right - left) / _NOMINAL_PX
@@ -155,7 +151,7 @@ class TickLogger:
                 self._scalars(f"{e.EXTRA}{path}/{each.name}", *values.tolist())
 
     def _log_image(self, frame: Frame) -> None:
-        if not self._images or frame.image.size == 0:
+        if self._style.second or frame.image.size == 0:  # the images of two sessions are those of the first
             return
         if self._placed_step != self.image_step:
             self._placed_step = self.image_step

@@ -82,26 +82,22 @@ class Overlay:
         self._status_bar.draw(canvas[self._height :], tick.stamp_ns, tick.mission, tick.estimate)
         return canvas
 
-    def _chip_to_px(self, points_um: Floats) -> Floats:
-        """Places on the chip to pixels of this picture."""
-        return self.zoom * self._image_points(self._scene.to_plane(points_um)) - 0.5
-
-    def _image_points(self, plane: Floats) -> Floats:
-        """Image positions of points (..., 2) of the picture plane."""
-        return plane @ self._to_image[:, :2].T + self._to_image[:, 2]
+    def _to_px(self, plane: Floats) -> Floats:
+        """Points (..., 2) of the picture plane to pixels of this picture."""
+        return self.zoom * (plane @ self._to_image[:, :2].T + self._to_image[:, 2]) - 0.5
 
     def _redraw(self, tick: Tick) -> Layer:
         """Draw what does not move: flow, route, goal, and the legend."""
         layer, field = Layer((self._height, self._width)), tick.field
         self._to_image = np.asarray(cv2.invertAffineTransform(self._scene.image_to_plane(tick)), np.float64)
         flow = None if field is None else self._draw_flow(layer, field, refined=tick.refined is not None)
-        path = self._chip_to_px(way_of(tick.route))
+        path = self._to_px(self._scene.to_plane(way_of(tick.route)))
         has_route = len(path) > 0 and drawable(path)
         if has_route:
             layer.lines([path], (), ROUTE, _LINE_PX * self._unit)
         goal = goal_of(tick.mission)
         if goal is not None:
-            centre, reach = self._chip_to_px(goal), max(1.5 * self._robot_px, 8.0 * self._unit)
+            centre, reach = self._to_px(self._scene.to_plane(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
             layer.lines([centre + reach * part for part in GOAL_SIGN], (), GOAL, _LINE_PX * self._unit)
         self._status_bar.set_legend(goal=goal is not None, route=has_route, flow=flow)
         return layer
@@ -114,7 +110,7 @@ class Overlay:
             return None
         fastest = float(np.quantile(speed[known], _FASTEST))
         px_per_speed = _LONGEST * self.zoom * self._scene.length_px(self._grid[1]) / fastest
-        middle = self.zoom * self._image_points((origins + 0.5 * vectors)[known]) - 0.5
+        middle = self._to_px((origins + 0.5 * vectors)[known])
         along = vectors[known] @ self._to_image[:, :2].T
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         half = 0.5 * px_per_speed * np.minimum(speed[known], 1.2 * fastest)[:, None] * along

@@ -118,10 +118,7 @@ def _log_all(
     stamp_ns = 0
     index: int | None = None
     with ColumnBuffer(stream) as columns:
-        loggers = [
-            TickLogger(stream, scene, prefix, images=prefix == prefixes[0], speeds=speeds, columns=columns)
-            for prefix in prefixes
-        ]
+        loggers = [TickLogger(stream, scene, prefix, speeds=speeds, columns=columns) for prefix in prefixes]
         each = [zip(itertools.repeat(logger), found) for logger, found in zip(loggers, ticks.values(), strict=True)]
         # In the order of stamps; of equal ones the first session's comes first.
         for count, (logger, tick) in enumerate(heapq.merge(*each, key=lambda item: item[1].stamp_ns)):

@@ -36,17 +36,12 @@ class Panel:
     hatched: Bools | None = None
 
 
-def typical_speed(field: FlowField, mask: Bools) -> float:
-    """Root mean square of the speed over the fluid, um/s."""
-    found = speed(field, mask)[mask]
-    return float(np.sqrt((found**2).mean())) if found.size else 0.0
-
-
 def not_known(field: FlowField, mask: Bools) -> Bools:
     """(h, w) fluid where one standard deviation exceeds NOT_KNOWN of the typical speed; all where none is stated."""
     if field.std_um_s is None:
         return mask
-    return mask & (uncertainty(field, mask) > NOT_KNOWN * typical_speed(field, mask))
+    typical = np.sqrt((speed(field, mask)[mask] ** 2).mean()) if mask.any() else 0.0  # root mean square, um/s
+    return mask & (uncertainty(field, mask) > NOT_KNOWN * typical)
 
 
 def known_text(field: FlowField, mask: Bools, name: str) -> str:
