@@ -114,8 +114,7 @@ class _Views:
         end = rr.TimeRangeBoundary.absolute(seconds=(1.0 + LEGEND) * self.end_s)
         if self.live:
             end = rr.TimeRangeBoundary.cursor_relative(seconds=max(LEGEND * self.end_s, _LEGEND_LIVE_S))
-        start = rr.TimeRangeBoundary.absolute(seconds=0.0)
-        return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
+        return axis_of(rr.TimeRangeBoundary.absolute(seconds=0.0), end)
 
     def lanes(self) -> Shown:
         """The timeline of states."""
@@ -275,6 +274,11 @@ def events_view(paths: Iterable[str], timeline_columns: Sequence[TimelineColumn]
     """The events of some entities as a log."""
     columns = rrb.TextLogColumns(timeline_columns=timeline_columns, text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/", contents=_contents(paths), columns=columns)
+
+
+def axis_of(start: rr.TimeRangeBoundary, end: rr.TimeRangeBoundary) -> rrb.TimeAxis:
+    """The axis of a plot between two times."""
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
 
 
 def legend_of(*, visible: bool) -> rrb.PlotLegend:

@@ -11,6 +11,7 @@ import rerun as rr
 
 SESSION_TIME = "session time"
 FRAME = "frame"
+LOG_TIME = "message_log_time"  # Rerun's name for the time of a message of an .mcap
 _ROWS = 64  # of an entity that wait at most
 _ENCODERS = 2  # threads
 

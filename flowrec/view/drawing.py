@@ -89,18 +89,14 @@ class Layer:
 
 def arrows(begins: Floats, ends: Floats, width_px: float) -> tuple[list[Floats], list[Floats]]:
     """Shafts and heads, for `Layer.lines`, of arrows from `begins` to `ends`, both (n, 2)."""
-    shafts, heads = [], []
-    for begin, end in zip(begins, ends, strict=True):
-        length = float(np.hypot(*(end - begin)))
-        if not drawable(np.array([begin, end])) or length <= 0.0:
-            continue
-        along = (end - begin) / length
-        head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
-        across = 0.45 * head * np.array([-along[1], along[0]])
-        base = end - head * along
-        shafts.append(np.array([begin, base]))
-        heads.append(np.array([end, base + across, base - across]))
-    return shafts, heads
+    lengths = np.hypot(*(ends - begins).T)
+    shown = [drawable(each) for each in zip(begins, ends, strict=True)] & (lengths > 0.0)
+    begins, ends, lengths = begins[shown], ends[shown], lengths[shown, None]
+    along = (ends - begins) / lengths
+    head = np.clip(_HEAD * lengths, *np.multiply(_HEAD_PX, width_px))
+    across = 0.45 * head * np.column_stack((-along[:, 1], along[:, 0]))
+    bases = ends - head * along
+    return list(np.stack((begins, bases), 1)), list(np.stack((ends, bases + across, bases - across), 1))
 
 
 def draw_outline(picture: Picture, line: Floats, colour: Rgb, width_px: float) -> None:

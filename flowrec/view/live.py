@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Literal
 
 from flowrec.view import live_server, viewer
@@ -13,7 +12,6 @@ Mode = Literal["spawn", "serve"]
 
 _START_S = 30.0  # for the server to accept viewers: importing Rerun takes a second, on a busy machine more
 _CLOSE_S = 10.0  # for the last ticks to be shown; then the process hangs
-_POLL_S = 0.02
 _MAX_HZ = 20.0
 _WITHOUT = "the run goes on without"
 
@@ -67,10 +65,8 @@ class LiveView(FeedSink):
 
     def _wait_until_it_accepts(self) -> None:
         """Wait for the server, so that its address is said when viewers can connect; end it if it takes too long."""
-        feed, end = self._feed, time.monotonic() + _START_S
-        while feed is not None and not feed.ended and not feed.has_logged(live_server.ACCEPTS):
-            if time.monotonic() > end:
-                feed.process.kill()
-                self._message = f"no live view: its server did not start within {_START_S:g} s; {_WITHOUT}"
-                return
-            time.sleep(_POLL_S)
+        feed = self._feed
+        if feed is None or viewer.until(lambda: feed.ended or feed.has_logged(live_server.ACCEPTS) or None, _START_S):
+            return
+        feed.process.kill()
+        self._message = f"no live view: its server did not start within {_START_S:g} s; {_WITHOUT}"
