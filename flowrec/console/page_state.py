@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from flowrec.core import Floats, Phase, Tick, printable, seconds, shift_px
-from flowrec.store import ChipCamera
 from flowrec.view import Batch, Scene, encode_jpeg, goal_of, state_text, way_of
 
 # What the page shows depends on these fields of a tick.
@@ -33,10 +32,6 @@ class PageState:
         self.tick = Tick()
         self.remarks: dict[str, Any] = {}
         self._scene = scene
-        left, top, right, bottom = scene.image_bounds()
-        size_px = round(right - left), round(bottom - top)
-        self._camera = ChipCamera(scene.calibration, size_px, scene.robot.radius_um)
-        self._image = self._camera.picture(None)
         self._walls_um = _outlines(scene)
         self._step = 1
 
@@ -48,24 +43,21 @@ class PageState:
             event = changes.get("event")
             if event is not None:
                 events.append({"s": round(seconds(event.stamp_ns), 2), "level": event.level, "text": event.text})
-            if changes.get("refined") is not None or changes.get("shift") is not None:
-                refined = self.tick.refined
-                self._image = self._camera.picture(None if refined is None else refined.registration, self.tick.shift)
         self._step, self.remarks = batch.step, batch.remarks
         return events
 
     def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
         """The place on the chip that the image shows there."""
-        x, y = (self._image.matrix @ np.array([x_px - 0.5, y_px - 0.5, 1.0])).tolist()
+        x, y = self._scene.from_plane(self._scene.image_to_plane(self.tick) @ (x_px, y_px, 1.0)).tolist()
         return x, y
 
     def drawing(self) -> Drawing:
         """Content that changes rarely: walls, route, goal; and the sizes."""
-        width, height = self._camera.size_px
+        left, top, right, bottom = self._scene.image_bounds()
         goal = goal_of(self.tick.mission)
         return {
-            "width": width,
-            "height": height,
+            "width": round(right - left),
+            "height": round(bottom - top),
             "um_per_px": self._scene.calibration.um_per_px,
             "radius": round(self._scene.length_px(self._scene.robot.radius_um), 2),
             "top_speed": self._scene.robot.max_speed_um_s,
@@ -114,7 +106,9 @@ class PageState:
         return [printable(f"{count} {what}") for what, count in counts.items() if count]
 
     def _pixels(self, points_um: Floats) -> list[list[float]]:
-        found: list[list[float]] = np.round(self._image.to_px(np.asarray(points_um, np.float64)), 1).tolist()
+        to_image = self._scene.plane_to_image(self.tick)
+        pixels = self._scene.to_plane(points_um) @ to_image[:, :2].T + to_image[:, 2]
+        found: list[list[float]] = np.round(pixels, 1).tolist()
         return found
 
 

@@ -96,19 +96,15 @@ class GreyScale:
     @classmethod
     def of(cls, session: Session, first: Frame) -> GreyScale:
         """That of a session."""
-        if first.bits <= 8:
-            return cls(8, 0, 255)
-        lows, highs = [], []
-        for share in np.linspace(0.0, 1.0, _SAMPLED):
-            begin, end = session.run.first_ns, session.run.last_ns
+        found = []
+        begin, end = session.run.first_ns, session.run.last_ns
+        for share in np.linspace(0.0, 1.0, _SAMPLED) if first.bits > 8 else ():
             frame = session.at(seconds(begin + round(share * (end - begin)))).frame
             levels = first.image if frame is None else frame.image
             seen = levels[levels > 0]  # 0 is also what lies outside of a recorded region
             if seen.size:
-                low, high = np.percentile(seen, (_DARKEST, _BRIGHTEST))
-                lows.append(low)
-                highs.append(high)
-        low, high = (int(min(lows)), int(np.ceil(max(highs)))) if lows else (0, 0)
+                found.append(np.percentile(seen, (_DARKEST, _BRIGHTEST)))
+        low, high = (int(np.min(found)), int(np.ceil(np.max(found)))) if found else (0, 0)
         return cls(first.bits, low, high) if high > low else cls(first.bits, 0, (1 << first.bits) - 1)
 
     def __call__(self, image: Image) -> NDArray[np.uint8]:

@@ -13,8 +13,7 @@ from flowrec.store import SLOTS
 from flowrec.view import colours
 from flowrec.view.bare_plots import EVENTS, IMAGE, MAPS, ON_IMAGE, PLOTS, STATES, Plot
 from flowrec.view.blueprint import LEGEND, axis_of, events_view, existing, layout_of, legend_of, tabs
-from flowrec.view.columns import LOG_TIME
-from flowrec.view.entities import points
+from flowrec.view.entities import LOG_TIME, points
 
 _MISSION = "/run/mission"
 

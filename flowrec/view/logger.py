@@ -29,9 +29,8 @@ from flowrec.physics import sample
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.camera_pictures import WindowCompleter, encode_jpeg
-from flowrec.view.columns import ColumnBuffer
 from flowrec.view.drawing import CIRCLE, CROSS, Trail
-from flowrec.view.entities import EntityLogger, label, points
+from flowrec.view.entities import ColumnBuffer, EntityLogger, label, points
 from flowrec.view.scene import Scene, goal_of, place_on_chip, way_of
 from flowrec.view.state_logger import StateLogger
 

@@ -40,14 +40,14 @@ class SpeedScale:
 
 def wave_fronts(time_s: NDArray[np.float32], mask: Bools, scale: ColourScale) -> rr.EncodedImage:
     """A time to go (h, w) with darker isochrones, two for each tick; red where the goal can not be reached."""
-    known = mask & np.isfinite(time_s)
-    pixels = scale.paint(np.where(known, time_s, np.nan))
-    interval = np.floor(np.where(known, time_s, 0.0) / (0.5 * scale.step))
+    time_s = np.where(mask & np.isfinite(time_s), time_s, np.nan)
+    pixels = scale.paint(time_s)
+    interval = np.floor(time_s / (0.5 * scale.step))
     front = np.zeros(mask.shape, np.bool_)
-    front[:, :-1] |= (interval[:, :-1] != interval[:, 1:]) & known[:, 1:]
-    front[:-1] |= (interval[:-1] != interval[1:]) & known[1:]
-    pixels[front & known] = (0.6 * pixels[front & known]).astype(np.uint8)
-    pixels[mask & ~known] = colours.UNREACHABLE
+    front[:, :-1] |= np.abs(np.diff(interval, axis=1)) > 0.0  # NaN is not above
+    front[:-1] |= np.abs(np.diff(interval, axis=0)) > 0.0
+    pixels[front] = (0.6 * pixels[front]).astype(np.uint8)
+    pixels[mask & np.isnan(time_s)] = colours.UNREACHABLE
     return encode_png(pixels)
 
 

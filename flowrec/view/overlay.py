@@ -79,7 +79,7 @@ class Overlay:
         canvas = self._canvas
         canvas[: self._height, : self._width] = picture
         canvas[: self._height, self._width :] = picture[:, -1:]
-        self._status_bar.draw(canvas[self._height :], tick.stamp_ns, tick.mission, tick.estimate)
+        self._status_bar.draw(canvas[self._height :], tick)
         return canvas
 
     def _to_px(self, plane: Floats) -> Floats:
@@ -89,7 +89,7 @@ class Overlay:
     def _redraw(self, tick: Tick) -> Layer:
         """Draw what does not move: flow, route, goal, and the legend."""
         layer, field = Layer((self._height, self._width)), tick.field
-        self._to_image = np.asarray(cv2.invertAffineTransform(self._scene.image_to_plane(tick)), np.float64)
+        self._to_image = self._scene.plane_to_image(tick)
         flow = None if field is None else self._draw_flow(layer, field, refined=tick.refined is not None)
         path = self._to_px(self._scene.to_plane(way_of(tick.route)))
         has_route = len(path) > 0 and drawable(path)

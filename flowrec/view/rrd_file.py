@@ -15,8 +15,7 @@ import rerun as rr
 
 from flowrec.core import Tick, seconds
 from flowrec.view.blueprint import blueprint
-from flowrec.view.columns import ColumnBuffer
-from flowrec.view.entities import SUMMARY
+from flowrec.view.entities import SUMMARY, ColumnBuffer
 from flowrec.view.logger import TickLogger
 from flowrec.view.maps import SpeedScale
 from flowrec.view.scene import Scene

@@ -52,6 +52,14 @@ class Scene:
         moved = self.to_plane(place_on_chip(tick, measured_um))
         return np.column_stack((moved[1] - moved[0], moved[2] - moved[0], moved[0]))
 
+    def plane_to_image(self, tick: Tick) -> Floats:
+        """(2, 3): the inverse of `image_to_plane`."""
+        return np.asarray(cv2.invertAffineTransform(self.image_to_plane(tick)), np.float64)
+
+    def from_plane(self, places: Floats) -> Floats:
+        """The picture plane (..., 2) to chip coordinates (..., 2) in um."""
+        return self.calibration.to_um(places - _HALF_PX)
+
     def directions(self, vectors: Floats) -> Floats:
         """Vectors (..., 2) along the chip's axes as vectors of the same length in the picture plane."""
         return vectors @ self.calibration.axes.T

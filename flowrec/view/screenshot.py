@@ -15,7 +15,7 @@ from rerun.experimental import ViewerClient, ViewerState
 from flowrec.core import PICTURE, FlowrecError, Output, nanoseconds
 from flowrec.store import ForeignError, SessionMetadata
 from flowrec.view import viewer
-from flowrec.view.columns import LOG_TIME, SESSION_TIME
+from flowrec.view.entities import LOG_TIME, SESSION_TIME
 
 _START_S = 20.0
 _LOAD_S = 60.0

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
-from flowrec.core import Estimate, Floats, Mission, printable, seconds
+from flowrec.core import Estimate, Floats, Mission, Tick, printable, seconds
 from flowrec.view import colours
 from flowrec.view.colours import Rgb, round_below
 from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, arrows, bgr, draw_mask
@@ -70,13 +70,14 @@ class StatusBar:
             self._parts.append(self._part(tip[0, 0], f"{words} {speed:g} µm/s", FLOW, *arrow, width=0.8))
         self._parts.append(self._scale_bar())
 
-    def draw(self, bar: Picture, stamp_ns: int, mission: Mission | None, estimate: Estimate | None) -> None:
+    def draw(self, bar: Picture, tick: Tick) -> None:
         """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first."""
         bar[:] = bgr(_GROUND)
         left = round(0.6 * self._letter)
-        left += draw_mask(bar, _clock_mask(clock_text(seconds(stamp_ns)), self._letter), left, self._top, _TEXT)
-        left += round(0.9 * self._letter)
-        left += draw_mask(bar, _text_mask(state_text(mission, estimate), self._letter), left, self._top, _TEXT)
+        clock = _clock_mask(clock_text(seconds(tick.stamp_ns)), self._letter)
+        left += draw_mask(bar, clock, left, self._top, _TEXT) + round(0.9 * self._letter)
+        state = _text_mask(state_text(tick.mission, tick.estimate), self._letter)
+        left += draw_mask(bar, state, left, self._top, _TEXT)
         right = bar.shape[1]
         for part in reversed(self._parts):
             begin = right - part.shape[1]
@@ -175,5 +176,5 @@ def _clock_mask(text: str, height_px: int) -> Picture:
     for letter in text:
         mask = _text_mask(letter, height_px)
         missing = widest - mask.shape[1] if letter in _DIGITS else 0
-        parts.append(np.pad(mask, ((0, 0), (missing // 2, missing - missing // 2))) if missing else mask)
+        parts.append(np.pad(mask, ((0, 0), (missing // 2, missing - missing // 2))))
     return np.hstack(parts)

@@ -300,10 +300,9 @@ def _speed_of(data: ReportData, name: str) -> Curve:
 def _limit(ax: Axes, curves: list[Curve]) -> None:
     """Limits by the curves: the first standard deviations of an observer are as wide as can be."""
     known = np.concatenate([curve.known for curve in curves])
-    if len(known):
-        low, high = min(float(known.min()), 0.0), max(float(known.max()), 0.0)
-        margin = 0.15 * max(high - low, 1.0)
-        ax.set_ylim(low - margin, high + margin)
+    low, high = known.min(initial=0.0), known.max(initial=0.0)
+    margin = 0.15 * max(high - low, 1.0)
+    ax.set_ylim(low - margin, high + margin)
 
 
 def _speed(field: FlowField, at_um: Floats) -> Floats:

@@ -51,17 +51,16 @@ class CurveBuilder:
     first_ns, last_ns : stamps between which the values lie.
     """
 
-    def __init__(self, first_ns: int, last_ns: int, buckets: int = BUCKETS) -> None:
+    def __init__(self, first_ns: int, last_ns: int) -> None:
         self._first_ns = first_ns
-        self._per_ns = buckets / max(last_ns - first_ns, 1)
-        self._last = buckets - 1
+        self._per_ns = BUCKETS / max(last_ns - first_ns, 1)
         self._rows: dict[int, tuple[int, float, float, float, float]] = {}  # number, time, mean, low, high by bucket
 
     def add(self, stamp_ns: int, value: float) -> None:
         """Take a value."""
         if not math.isfinite(value):
             return
-        at = min(max(int((stamp_ns - self._first_ns) * self._per_ns), 0), self._last)
+        at = min(max(int((stamp_ns - self._first_ns) * self._per_ns), 0), BUCKETS - 1)
         count, time_s, mean, low, high = self._rows.get(at, (0, 0.0, 0.0, value, value))
         count += 1
         # Running means: a sum of the largest floating-point numbers would overflow.

@@ -127,8 +127,7 @@ class History:
 
     def curve(self, name: str) -> Curve:
         """A curve of those above; empty if nothing was recorded for it."""
-        builder = self._builders.get(name)
-        return (builder or CurveBuilder(self.first_ns, self.last_ns, 1)).curve()
+        return self._builders.get(name, CurveBuilder(self.first_ns, self.last_ns)).curve()
 
     def add(self, tick: Tick) -> None:
         """Take the next tick."""

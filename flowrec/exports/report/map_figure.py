@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -175,10 +175,9 @@ def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figur
 def _show(ax: Axes, panel: Panel, box: tuple[slice, slice]) -> AxesImage:
     style.bare(ax)
     ax.set_facecolor(style.SOLID)
-    colours: dict[str, Any] = {"speed": style.SPEEDS, "uncertainty": style.DEVIATIONS, "change": style.CHANGES}
     shown = ax.imshow(
         panel.values[box],
-        cmap=colours[panel.scale.table],
+        cmap=style.COLOUR_MAPS[panel.scale.table],
         vmin=panel.scale.low,
         vmax=panel.scale.high,
         interpolation="nearest",

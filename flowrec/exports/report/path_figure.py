@@ -137,7 +137,7 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
     scale = data.speed_scale()
     opacity = _OVER_PICTURE if data.picture is not None else 1.0
     values = speed(field, scene.chip.mask)
-    how = {"cmap": style.SPEEDS, "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
+    how = {"cmap": style.COLOUR_MAPS["speed"], "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
     speeds = _on_mask(ax, data, values, **how)
     bar = figure.colorbar(speeds, ax=ax, shrink=0.85, aspect=22, pad=0.01, ticks=scale.ticks)
     bar.set_label("speed of the flow (µm/s)")

@@ -119,23 +119,20 @@ def picture_of(session: Session) -> CameraImage | None:
     if not session.reader.counts.get("frame"):
         return None
     first_ns, last_ns = session.run.first_ns, session.run.last_ns
-    frames = {}
+    images: dict[int, Image] = {}
     for stamp_ns in np.linspace(first_ns, last_ns, _IMAGES).astype(np.int64).tolist():
         frame = session.reader.tick_before(stamp_ns).frame
         if frame is not None and frame.image.size:
-            frames[frame.index] = frame
-    if not frames:
+            images[frame.index] = frame.image
+    if not images:
         return None
-    images = [frame.image for frame in frames.values()]
-    whole = [image for image in images if image.shape == images[0].shape and _is_whole(image)]
-    chosen = np.stack(whole or images[:1])
+    first, *_ = images.values()
+    height, width = first.shape
+    alike = [image for image in images.values() if image.shape == first.shape]
+    whole = [image for image in alike if nonzero_window(image) == (0, 0, width, height)]
+    chosen = np.stack(whole or [first])
     step = -(-chosen.shape[2] // _LARGEST_PX)
     grey = np.median(chosen[:, ::step, ::step], axis=0)
     low, high = np.percentile(grey, (_DARKEST, _BRIGHTEST))
     levels = np.clip((grey - low) / max(high - low, 1.0) * 255.0, 0.0, 255.0)
     return CameraImage(levels.astype(np.uint8), step, len(chosen))
-
-
-def _is_whole(image: Image) -> bool:
-    height, width = image.shape
-    return nonzero_window(image) == (0, 0, width, height)

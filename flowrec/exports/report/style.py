@@ -21,7 +21,7 @@ WIDTHS_MM = (NARROW_MM, WIDE_MM)
 INK, QUIET, FAINT, SOLID = "#222222", "#767676", "#dddddd", "#c8c8c8"
 # Distinguishable with colour blindness (Okabe and Ito 2008).
 ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7"
-SPEEDS, DEVIATIONS, CHANGES = "YlGnBu", "Purples", "PuOr"
+COLOUR_MAPS = {"speed": "YlGnBu", "uncertainty": "Purples", "change": "PuOr"}  # by ColourScale.table
 FONT_PT = 7.0
 PAGE_DPI, PAPER_DPI = 140, 300  # of images inside of a figure
 _RC: dict[str, Any] = {
@@ -80,13 +80,13 @@ def drawing() -> Iterator[None]:
         yield
 
 
-def new_figure(width_mm: float, height_mm: float) -> Figure:
+def new_figure(width_mm: float, height_mm: float, dpi: int = PAGE_DPI) -> Figure:
     """An empty figure without a window and without pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     size = (width_mm / MM_PER_INCH, height_mm / MM_PER_INCH)
-    figure = Figure(figsize=size, layout="constrained", dpi=PAGE_DPI)
+    figure = Figure(figsize=size, layout="constrained", dpi=dpi)
     FigureCanvasAgg(figure)
     return figure
 
