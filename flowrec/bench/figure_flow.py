@@ -108,8 +108,7 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
         beside: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
         ax.annotate(f"{mean:.3f}\n±{std:.3f}", (at + 0.26, mean), fontsize=7.5, color=INK, **beside)
     count = len({row["case"] for row in rows})
-    style(ax, f"{count} cases, a dot each, the case above circled; mean ± standard deviation")
-    ax.set_ylabel("relative RMSE of v", fontsize=9, color=INK)
+    style(ax, f"{count} cases, a dot each, the case above circled; mean ± standard deviation", y="relative RMSE of v")
     ax.set_yscale("log")
     errors = [max(row["rmse_v"], 1e-3) for row in rows]
     low, high = 0.75 * min(errors), 1.35 * max(errors)

@@ -1,4 +1,7 @@
-"""Lines, arrows and letters on pictures (h, w, 3) in BGR. Lines have a dark rim: they are seen on light and on dark."""
+"""Pictures by OpenCV: the camera's images for people to look at, and lines, arrows and letters on them.
+
+Pictures are (h, w, 3) in BGR. Lines have a dark rim: they are seen on light and on dark.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import NS_PER_S, Floats
+from flowrec.core import NS_PER_S, Floats, Image
+from flowrec.store import nonzero_window
 from flowrec.view.colours import SOLID, Rgb
 
 Picture = NDArray[np.uint8]
 SUBPIXEL_BITS = 4  # coordinates of OpenCV's lines are given in 1/16 px
+_DIMMING = 0.6  # factor on an older image, which shows that it is older
 _RIM = 0.75  # opacity of the rim
 _TRAIL_S = 4.0
 _FAR_PX = 1e5  # beyond it nothing is drawn
@@ -24,6 +29,37 @@ _HEAD_PX = (2.5, 6.0)  # least and largest, in widths of its line
 _ANGLE = np.linspace(0.0, 2.0 * np.pi, 33)
 CIRCLE: Floats = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
 CROSS: tuple[Floats, Floats] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
+
+
+class WindowCompleter:
+    """Completes one image after the other where only a region was recorded (store/roi.py)."""
+
+    def __init__(self) -> None:
+        self._complete: Image | None = None  # the last image without a region, and the same dimmed
+        self._dimmed: Image | None = None
+
+    def complete(self, image: Image) -> Image:
+        """A recorded region (h, w) within the last complete image, which is dimmed."""
+        x0, y0, x1, y1 = nonzero_window(image)
+        if (x0, y0) == (0, 0) and (y1, x1) == image.shape:
+            self._complete, self._dimmed = image, None
+            return image
+        if self._complete is None or self._complete.shape != image.shape:
+            return image
+        if self._dimmed is None:
+            self._dimmed = (_DIMMING * self._complete).astype(image.dtype)
+        completed = self._dimmed.copy()
+        completed[y0:y1, x0:x1] = image[y0:y1, x0:x1]
+        return completed
+
+
+def encode_jpeg(image: Image, bits: int, quality: int) -> bytes:
+    """An image (h, w) of that many bits as JPEG, of its upper 8 bits."""
+    if bits > 8:
+        image = (image >> (bits - 8)).astype(np.uint8)
+    done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return jpeg.tobytes()
 
 
 class Trail:
@@ -104,16 +140,6 @@ def draw_outline(picture: Picture, line: Floats, colour: Rgb, width_px: float) -
     for shade, rim in ((SOLID, 1.0), (colour, 0.0)):
         width = max(round(width_px + rim), 1)
         cv2.polylines(picture, [to_fixed_point(line)], False, bgr(shade), width, cv2.LINE_AA, SUBPIXEL_BITS)
-
-
-def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
-    """Put letters, a mask of grey levels (h, w), on a picture of one colour; returns their width in px."""
-    rows, columns = max(picture.shape[0] - top, 0), max(picture.shape[1] - left, 0)
-    mask = mask[:rows, :columns]
-    part = picture[top : top + mask.shape[0], left : left + mask.shape[1]]
-    alpha = mask[..., None] * np.float32(1.0 / 255.0)
-    part[:] = part * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32) + 0.5
-    return int(mask.shape[1])
 
 
 def restore(picture: Picture, clean: Picture, centre: Floats, radius_px: float) -> None:

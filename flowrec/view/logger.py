@@ -28,8 +28,7 @@ from flowrec.core import (
 from flowrec.physics import sample
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
-from flowrec.view.camera_pictures import WindowCompleter, encode_jpeg
-from flowrec.view.drawing import CIRCLE, CROSS, Trail
+from flowrec.view.drawing import CIRCLE, CROSS, Trail, WindowCompleter, encode_jpeg
 from flowrec.view.entities import ColumnBuffer, EntityLogger, label, points
 from flowrec.view.scene import Scene, goal_of, place_on_chip, way_of
 from flowrec.view.state_logger import StateLogger
@@ -96,7 +95,11 @@ class TickLogger:
         self._last, self._tick = self._tick, tick
         self._entities.set_time(tick.stamp_ns, tick.frame.index if tick.frame is not None else frame_index)
         if tick.refined is not self._last.refined or tick.shift is not self._last.shift:
-            self._log_registration(tick)
+            # The image moves as the registration that a refinement found, and the shift of a shaking stage, say.
+            placed = self._scene.image_to_plane(tick)
+            if not np.array_equal(placed, self._placed):
+                self._placed = placed
+                self._log(e.MEASURED, maps.transform_of(placed))
         self.states.end_marks(tick.stamp_ns)
         if tick.frame is not None and tick.frame is not self._last.frame:
             self._log_image(tick.frame)
@@ -244,10 +247,3 @@ class TickLogger:
         # The time is in the text: a column of the view shows it to the nanosecond.
         whose = f"{self._entities.prefix}: " if self._entities.prefix else ""
         self._log(entity, rr.TextLog(f"{seconds(self._tick.stamp_ns):.1f} s  {whose}{text}", level=level))
-
-    def _log_registration(self, tick: Tick) -> None:
-        """Move the image as the registration that a refinement found, and the shift of a shaking stage, say."""
-        placed = self._scene.image_to_plane(tick)
-        if not np.array_equal(placed, self._placed):
-            self._placed = placed
-            self._log(e.MEASURED, maps.transform_of(placed))

@@ -17,7 +17,7 @@ from PIL import ImageDraw, ImageFont
 from flowrec.core import Estimate, Floats, Mission, Tick, printable, seconds
 from flowrec.view import colours
 from flowrec.view.colours import Rgb, round_below
-from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, arrows, bgr, draw_mask
+from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, arrows, bgr
 
 ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
 _TEXT, _GROUND = colours.WHITE, (24, 24, 28)
@@ -74,10 +74,9 @@ class StatusBar:
         """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first."""
         bar[:] = bgr(_GROUND)
         left = round(0.6 * self._letter)
-        clock = _clock_mask(clock_text(seconds(tick.stamp_ns)), self._letter)
-        left += draw_mask(bar, clock, left, self._top, _TEXT) + round(0.9 * self._letter)
-        state = _text_mask(state_text(tick.mission, tick.estimate), self._letter)
-        left += draw_mask(bar, state, left, self._top, _TEXT)
+        left += self._write(bar, _clock_mask(clock_text(seconds(tick.stamp_ns)), self._letter), left)
+        left += round(0.9 * self._letter)
+        left += self._write(bar, _text_mask(state_text(tick.mission, tick.estimate), self._letter), left)
         right = bar.shape[1]
         for part in reversed(self._parts):
             begin = right - part.shape[1]
@@ -107,11 +106,19 @@ class StatusBar:
         sign = math.ceil(sign_px)
         picture = np.empty((self._height, sign + gap + mask.shape[1] + round(1.2 * self._letter), 3), np.uint8)
         picture[:] = bgr(_GROUND)
-        draw_mask(picture, mask, sign + gap, self._top, _TEXT)
+        self._write(picture, mask, sign + gap)
         layer = Layer(picture.shape[:2])
         layer.lines(lines, heads, colour, width * self._line)
         layer.blend(picture[..., 0].copy(), picture)
         return picture
+
+    def _write(self, picture: Picture, mask: Picture, left: int) -> int:
+        """Put letters, a mask of grey levels (h, w), on a picture of one colour; returns their width in px."""
+        part = picture[self._top :, left:][: mask.shape[0], : mask.shape[1]]
+        mask = mask[: part.shape[0], : part.shape[1]]
+        alpha = mask[..., None] * np.float32(1.0 / 255.0)
+        part[:] = part * (1.0 - alpha) + alpha * np.array(bgr(_TEXT), np.float32) + 0.5
+        return int(mask.shape[1])
 
 
 def clock_text(time_s: float) -> str:

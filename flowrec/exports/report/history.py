@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -138,8 +139,7 @@ class History:
 
     def _take(self, message: Any) -> None:
         """Take a new message of the last tick."""
-        stamp_ns: int = message.stamp_ns
-        now_s = seconds(stamp_ns)
+        now_s, put = seconds(message.stamp_ns), partial(self._put, message.stamp_ns)
         match message:
             case Event():
                 self._remark(Remark(now_s, message.text, level=message.level))
@@ -155,24 +155,23 @@ class History:
             case Estimate():
                 self._estimate(message)
             case Demand():
-                self._put(stamp_ns, demand_um_s=math.hypot(*message.velocity_um_s))
-                self._put(stamp_ns, error_um=message.error_um)
+                put(demand_um_s=math.hypot(*message.velocity_um_s))
+                put(error_um=message.error_um)
             case Health():
                 self._health(message)
             case Truth():
-                self._put(stamp_ns, true_x_um_s=message.flow_um_s[0], true_y_um_s=message.flow_um_s[1])
+                put(true_x_um_s=message.flow_um_s[0], true_y_um_s=message.flow_um_s[1])
             case Timing():
-                dropped, tick_ms = message.dropped_frames, message.total_ms
-                self._put(stamp_ns, tick_ms=tick_ms, queue_mb=message.queue_mb, dropped=dropped)
+                put(tick_ms=message.total_ms, queue_mb=message.queue_mb, dropped=message.dropped_frames)
             case Drops():
                 self.drops[message.topic] = message
             case Clocks():
                 self.clocks = message
                 if message.rate:
-                    self._put(stamp_ns, late_ms=1e3 * message.late_s, latest_ms=1e3 * message.latest_s)
+                    put(late_ms=1e3 * message.late_s, latest_ms=1e3 * message.latest_s)
             case CameraLosses():
                 self.losses = message
-                self._put(stamp_ns, lost=message.link + message.incomplete + message.driver + message.backlog)
+                put(lost=message.link + message.incomplete + message.driver + message.backlog)
 
     def _put(self, stamp_ns: int, **values: float) -> None:
         """Values that belong together: all of them, or none where one is not finite."""
@@ -193,9 +192,10 @@ class History:
         if not self.found and self.last.track is not None:
             return
         stamp_ns, position_um, tick = estimate.stamp_ns, estimate.position_um, self.last
+        put = partial(self._put, stamp_ns)
         if not np.isfinite(position_um).all():
             return
-        self._put(stamp_ns, x_um=position_um[0], y_um=position_um[1])
+        put(x_um=position_um[0], y_um=position_um[1])
         before_ns, before_um = self._position or (stamp_ns, position_um)
         moved_s = seconds(stamp_ns - before_ns)
         if moved_s >= _SPEED_OVER_S:
@@ -204,13 +204,13 @@ class History:
             self._position = (stamp_ns, position_um)
         variance = np.diagonal(estimate.covariance)[2:4]
         flow_std = math.sqrt(max(float(variance.mean()), 0.0)) if variance.size else math.nan
-        self._put(stamp_ns, flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1])
-        self._put(stamp_ns, flow_std_um_s=flow_std)
+        put(flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1])
+        put(flow_std_um_s=flow_std)
         if tick.field is not None:
             on_map = sample(tick.field, position_um)
-            self._put(stamp_ns, map_x_um_s=on_map[0], map_y_um_s=on_map[1])
+            put(map_x_um_s=on_map[0], map_y_um_s=on_map[1])
         if tick.truth is not None and tick.truth.stamp_ns == stamp_ns:
-            self._put(stamp_ns, estimate_error_um=math.dist(position_um, tick.truth.position_um))
+            put(estimate_error_um=math.dist(position_um, tick.truth.position_um))
 
     def _health(self, health: Health) -> None:
         self._put(health.stamp_ns, nis=health.nis)
