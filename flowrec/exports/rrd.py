@@ -65,19 +65,19 @@ class RrdExport:
             key=session.key,
             doubts=str(session.outcome.get(DOUBTS, "")),
         )
-        prefixes: tuple[str, ...] = ("",)
-        sessions = [session]
+        shown = {"": session}
         parent = _parent_of(session)
         if self._second is not None:
-            prefixes, sessions = PAIR, [session, self._second]
+            shown = dict(zip(PAIR, (session, self._second), strict=True))
             summary = _pair(session, self._second)
         elif parent is not None:
-            prefixes, sessions = REPLAY, [Session(parent), session]
-            summary = _comparison(*sessions)
+            shown = dict(zip(REPLAY, (Session(parent), session), strict=True))
+            summary = _comparison(*shown.values())
         else:
             summary = document_of_run(session.path.stem, session.last, session.outcome)
-        ticks = [each.ticks(with_frames=each is sessions[0]) for each in sessions]
-        write_rrd(part, scene, dict(zip(prefixes, ticks, strict=True)), progress, summary)
+        first = next(iter(shown.values()))
+        ticks = {prefix: each.ticks(with_frames=each is first) for prefix, each in shown.items()}
+        write_rrd(part, scene, ticks, progress, summary)
 
 
 def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:

@@ -150,11 +150,8 @@ def _stay(port: int, window: subprocess.Popen[bytes] | None) -> None:
     if not _is_watched(port, window):
         return
     print(STAYS, flush=True)
-    seen_s = time.monotonic()
-    while time.monotonic() - seen_s < ABSENT_S:
+    while viewer.until(lambda: _is_watched(port, window) or None, ABSENT_S):
         time.sleep(_POLL_S)
-        if _is_watched(port, window):
-            seen_s = time.monotonic()
 
 
 def _is_watched(port: int, window: subprocess.Popen[bytes] | None) -> bool:

@@ -112,27 +112,27 @@ def _log_all(
     present: AbstractSet[str],
 ) -> None:
     describe(stream, scene)
-    prefixes, speeds = tuple(ticks), SpeedScale()
+    speeds = SpeedScale()
     first_ns: int | None = None
     stamp_ns = 0
     index: int | None = None
     with ColumnBuffer(stream) as columns:
-        loggers = [TickLogger(stream, scene, prefix, speeds=speeds, columns=columns) for prefix in prefixes]
-        each = [zip(itertools.repeat(logger), found) for logger, found in zip(loggers, ticks.values(), strict=True)]
+        loggers = {prefix: TickLogger(stream, scene, prefix, speeds=speeds, columns=columns) for prefix in ticks}
+        first = next(iter(loggers.values()))
+        each = [zip(itertools.repeat(loggers[prefix]), found) for prefix, found in ticks.items()]
         # In the order of stamps; of equal ones the first session's comes first.
         for count, (logger, tick) in enumerate(heapq.merge(*each, key=lambda item: item[1].stamp_ns)):
             stamp_ns = tick.stamp_ns
             first_ns = stamp_ns if first_ns is None else first_ns
-            if logger is loggers[0] and tick.frame is not None:
+            if logger is first and tick.frame is not None:
                 index = tick.frame.index
             # Replayed ticks may have no frame, but belong to a recorded one.
             logger.log(tick, frame_index=index)
             if count % _PROGRESS_EVERY == 0:
                 progress(seconds(stamp_ns - first_ns))
         columns.flush()
-    present |= loggers[0].present
-    for prefix, logger in zip(prefixes[1:], loggers[1:], strict=True):
-        present |= {f"{prefix} {what}" for what in logger.present}
+    for prefix, logger in loggers.items():
+        present |= {what if logger is first else f"{prefix} {what}" for what in logger.present}
     # Last, when it is known which views are not empty. Rerun accepts it anywhere in the file.
-    phases = [logger.states.phases for logger in loggers]
-    stream.send_blueprint(blueprint(scene, prefixes, present, seconds(stamp_ns), phases))
+    phases = [logger.states.phases for logger in loggers.values()]
+    stream.send_blueprint(blueprint(scene, tuple(loggers), present, seconds(stamp_ns), phases))

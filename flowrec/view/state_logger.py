@@ -93,9 +93,8 @@ class StateLogger:
         if state == self._now.get(lane, _NONE):
             return
         self._now[lane] = state
-        known = self._colours.setdefault(lane, {})
+        known = self._colours.setdefault(lane, {_NONE: colour})
         if state not in known and len(known) < _STATES:
-            known.setdefault(_NONE, colour)
             known[state] = colour
             shown = rr.StateConfiguration(
                 values=list(known),

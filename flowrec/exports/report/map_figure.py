@@ -75,7 +75,7 @@ class MapFigure:
                 parts.append("Change: refined minus assumed speed.")
         else:
             parts.append("The flow was not refined in this session: there is no map after a refinement.")
-        best = refined if refined is not None else assumed
+        best = data.history.last.field
         assert best is not None
         parts.append(known_text(best, mask, "refined" if refined is not None else "assumed"))
         if data.truth is not None:
@@ -96,35 +96,35 @@ class ChangeFigure:
     title = "Flow map as recorded and as replayed"
 
     def __init__(self, before: FlowField | None, after: FlowField | None, number: int) -> None:
-        self._before, self._after = before, after
+        self._maps = {"recorded": before, "replayed": after}
         self.name = f"replay_{number}"
 
     def why_not(self, _story: ReportData) -> str:
-        if self._before is None or self._after is None:
+        before, after = self._maps.values()
+        if before is None or after is None:
             return "one of the two holds no map of the flow"
-        if self._before.same_as(self._after):
+        if before.same_as(after):
             return "the replay has the map of the recording, unchanged"
-        if self._before.velocity_um_s.shape != self._after.velocity_um_s.shape:
+        if before.velocity_um_s.shape != after.velocity_um_s.shape:
             return "the two maps have different sizes"
         return ""
 
     def caption(self, data: ReportData) -> str:
-        assert self._before is not None and self._after is not None
+        before, after = self._maps.values()
+        assert before is not None and after is not None
         return (
-            f"Recorded: the best map of the session (method {self._before.method}). Replayed: that of the replay "
-            f"(method {self._after.method}). Change: replayed minus recorded speed. "
-            + known_text(self._after, data.scene.chip.mask, "replayed")
+            f"Recorded: the best map of the session (method {before.method}). Replayed: that of the replay "
+            f"(method {after.method}). Change: replayed minus recorded speed. "
+            + known_text(after, data.scene.chip.mask, "replayed")
         )
 
     def alt(self, data: ReportData) -> str:
         return f"Maps of the flow on the chip {data.scene.chip.name}: recorded, replayed, and their difference."
 
     def draw(self, data: ReportData, width_mm: float) -> Figure:
-        assert self._before is not None and self._after is not None
         mask = data.scene.chip.mask
-        named = {"recorded": self._before, "replayed": self._after}
-        largest = max(float(np.nanmax(speed(field, mask))) for field in named.values())
-        return draw_panels(_panels_of(named, ColourScale.up_to(largest, "speed"), mask), data, width_mm)
+        largest = max(float(np.nanmax(speed(field, mask))) for field in self._maps.values() if field is not None)
+        return draw_panels(_panels_of(self._maps, ColourScale.up_to(largest, "speed"), mask), data, width_mm)
 
 
 def _panels(data: ReportData) -> list[Panel]:
@@ -150,11 +150,7 @@ def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: 
 def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figure:
     """Maps side by side, each kind of value with its colour bar; several rows where they do not fit in one."""
     mask, um_per_px = data.scene.chip.mask, data.scene.chip.um_per_px
-    rows_px, columns_px = np.nonzero(mask)
-    box = (
-        slice(max(rows_px.min() - _MARGIN_PX, 0), rows_px.max() + _MARGIN_PX + 1),
-        slice(max(columns_px.min() - _MARGIN_PX, 0), columns_px.max() + _MARGIN_PX + 1),
-    )
+    box = tuple(slice(max(at.min() - _MARGIN_PX, 0), at.max() + _MARGIN_PX + 1) for at in np.nonzero(mask))
     height_px, width_px = mask[box].shape
     columns = min(len(panels), 2 if width_mm > style.NARROW_MM else 1)
     rows = -(-len(panels) // columns)
@@ -172,7 +168,7 @@ def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figur
     return figure
 
 
-def _show(ax: Axes, panel: Panel, box: tuple[slice, slice]) -> AxesImage:
+def _show(ax: Axes, panel: Panel, box: tuple[slice, ...]) -> AxesImage:
     style.bare(ax)
     ax.set_facecolor(style.SOLID)
     shown = ax.imshow(

@@ -96,11 +96,8 @@ def legend_above(ax: Axes, columns: int = 4) -> None:
     figure = ax.get_figure()
     assert figure is not None
     narrow = figure.bbox.width / PAGE_DPI * MM_PER_INCH <= NARROW_MM + 0.5
-    handles, labels = ax.get_legend_handles_labels()
-    if handles:
+    if ax.get_legend_handles_labels()[0]:
         ax.legend(
-            handles,
-            labels,
             loc="lower left",
             bbox_to_anchor=(0.0, 1.0),
             ncols=min(columns, 2) if narrow else columns,
