@@ -85,9 +85,8 @@ def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:
 
     pair = ReplayFiles.of(recorded, replayed)
     rows = before_after(pair)
-    planners = next((values for key, *values in rows if key == "planner"), [None, None])
-    hidden = {*_OF_COMMANDS, *(("planner",) if planners[0] == planners[1] else ())}
-    shown = [row for row in rows if row[0] not in hidden]
+    told = [row for row in rows if row[0] not in _OF_COMMANDS]
+    shown = [(key, was, now) for key, was, now in told if key != "planner" or was != now]
     return summary_document(["recorded", "replayed"], shown, [registration_remark(pair.replayed.refined)])
 
 

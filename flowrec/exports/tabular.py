@@ -118,16 +118,14 @@ class CsvExport(_Tables):
     advice = "a table a topic, for spreadsheets and everything else, is in"
 
     def open_writer(self, path: Path, schema: pa.Schema) -> Any:
-        flat = pa.schema([field if not pa.types.is_nested(field.type) else _text(field) for field in schema])
-        return pyarrow.csv.CSVWriter(path, flat)
+        return pyarrow.csv.CSVWriter(path, pa.schema([_text(field) for field in schema]))
 
     def select(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
         schema = table if isinstance(table, pa.Schema) else table.schema
         kept = [field for field in schema if not _is_raster(field.type)]
         if table is schema:
             return pa.schema(kept, metadata=schema.metadata)
-        columns = [table.column(field.name) for field in kept]
-        cells = [_cells(column) for column in columns]
+        cells = [_cells(table.column(field.name)) for field in kept]
         return pa.RecordBatch.from_arrays(cells, schema=pa.schema([_text(field) for field in kept]))
 
 

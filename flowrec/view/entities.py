@@ -151,13 +151,10 @@ class ColumnBuffer:
             indexes.append(rr.TimeColumn(FRAME, sequence=frames))
         columns: list[Any] = []
         for name, lists in zip(names, fields, strict=True):
-            components = [_result(component) for components in lists for component in components]
+            values = [value for components in lists for value in components]
+            components = [value.result() if isinstance(value, Future) else value for value in values]
             columns += kind.columns(**{name: components}).partition([len(each) for each in lists])
         rr.send_columns(path, indexes, columns, recording=self._stream, strict=True)
-
-
-def _result(component: Any) -> Any:
-    return component.result() if isinstance(component, Future) else component
 
 
 class EntityLogger:

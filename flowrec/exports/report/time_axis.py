@@ -45,9 +45,8 @@ def panels(history: History, width_mm: float, heights_mm: list[float]) -> tuple[
             ax.axvline(at_s, color=style.FAINT, lw=0.6, zorder=0)
     axes[-1].set_xlabel("session time (s)")
     axes[-1].set_xlim(history.first_s, history.last_s)
-    for ax in axes[:-1]:
-        ax.tick_params(labelbottom=False)
-    axes[-1].tick_params(labelbottom=True)
+    for ax in axes:
+        ax.tick_params(labelbottom=ax is axes[-1])
     figure.align_ylabels(axes)
     return figure, list(axes)
 
