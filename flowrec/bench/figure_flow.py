@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from flowrec.bench.figures import INK, MM_PER_UM, QUIET, SOLID, bare, new_figure, style
+from flowrec.bench.figures import INK, MM_PER_UM, QUIET, SOLID, new_figure, style
+from flowrec.exports import style as report_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,7 +68,7 @@ def _case(figure: SubFigure, picture: FlowPanels, errors: dict[str, float]) -> N
     error_top = max(min(0.5 * speed_top, worst), 1e-6 * speed_top)
     arrows = _arrow_places(picture.mask)
     for ax in axes.flat:
-        bare(ax)
+        report_style.bare(ax)
     for ax, (name, field) in zip(axes[0], {"truth": picture.truth, **picture.fields}.items(), strict=True):
         speeds = _show(ax, _length(field), picture.mask, SPEEDS, speed_top)
         _arrows(ax, field, arrows, speed_top)
@@ -107,8 +108,7 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
         beside: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
         ax.annotate(f"{mean:.3f}\n±{std:.3f}", (at + 0.26, mean), fontsize=7.5, color=INK, **beside)
     count = len({row["case"] for row in rows})
-    style(ax, f"{count} cases, a dot each, the case above circled; mean ± standard deviation")
-    ax.set_ylabel("relative RMSE of v", fontsize=9, color=INK)
+    style(ax, f"{count} cases, a dot each, the case above circled; mean ± standard deviation", y="relative RMSE of v")
     ax.set_yscale("log")
     errors = [max(row["rmse_v"], 1e-3) for row in rows]
     low, high = 0.75 * min(errors), 1.35 * max(errors)

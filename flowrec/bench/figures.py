@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.exports import style as report_style
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 SOLID = "#d4d4d4"
 INK = "#262626"
 QUIET = "#8c8c8c"
-MM_PER_UM = 1e-3
+MM_PER_UM, MM_PER_INCH = report_style.MM_PER_UM, report_style.MM_PER_INCH
 # Distinguishable with colour blindness (Okabe and Ito), then lighter and darker ones.
 _PALETTE = (
     "#d55e00", "#e69f00", "#0072b2", "#56b4e9", "#009e73", "#88c9b5", "#999999", "#cc79a7", "#7a5195", "#5c4a1f",
@@ -34,12 +36,7 @@ _LARGEST_RATIO = 3.0  # of arrival times in the figure; larger ones are drawn at
 
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure without a window and without pyplot's global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width_in, height_in), layout="constrained", dpi=160)
-    FigureCanvasAgg(figure)
-    return figure
+    return report_style.new_figure(MM_PER_INCH * width_in, MM_PER_INCH * height_in, dpi=160)
 
 
 def style(ax: Axes, title: str = "", x: str = "", y: str = "", *, grid: bool = True) -> None:
@@ -53,13 +50,6 @@ def style(ax: Axes, title: str = "", x: str = "", y: str = "", *, grid: bool = T
     ax.set_axisbelow(True)
     ax.spines[["top", "right", "left"]].set_visible(False)
     ax.spines["bottom"].set_color(QUIET)
-
-
-def bare(ax: Axes) -> None:
-    """An axis for an image: no ticks, no frame."""
-    ax.set_xticks([])
-    ax.set_yticks([])
-    ax.spines[:].set_visible(False)
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:
@@ -86,7 +76,7 @@ def draw_plan(path: Path, examples: list[tuple[TripCase, Trip, dict[str, Route]]
             ax.plot(*(point / px), marker, color=INK, markersize=7, markerfacecolor="white")
         ax.set_title(f"{world.name}: upstream, fastest flow 0.9 of the robot's speed", fontsize=9, color=INK)
         ax.legend(fontsize=7, loc="best")
-        bare(ax)
+        report_style.bare(ax)
     regimes = list(dict.fromkeys((row["ratio"], row["direction"]) for row in rows))
     axes = below.subplots(2, len(regimes), squeeze=False, sharey="row")
     for column, (ratio, direction) in enumerate(regimes):

@@ -52,7 +52,7 @@ def application(board: Board, token: str, port: int, rerun_port: int | None, ans
             {"name": row.name, "key": row.key, "words": row.words, "meaning": row.meaning} for row in COMMANDS.values()
         ]
         facts = json.dumps({"commands": rows, "longest_note": LONGEST_NOTE, "rerun": rerun_port is not None})
-        return _file("console.html", {"FACTS": html.escape(facts), "NAME": html.escape(board.name)})
+        return _file("console.html", FACTS=html.escape(facts), NAME=html.escape(board.name))
 
     async def part(request: Request) -> Response:
         return _file(request.path_params["name"])
@@ -146,7 +146,7 @@ class _Commands:
                 raise ValueError("too many at once; wait a second")
             self._given_s.append(now_s)
         if name == GOAL:
-            x_um, y_um = self._board.chip_um(*_finite(asked["x_px"], asked["y_px"]))
+            x_um, y_um = self._board.page_state.chip_um(*_finite(asked["x_px"], asked["y_px"]))
             return {"command": name, "x_um": x_um, "y_um": y_um}
         if name == SPEED:
             limit = asked["limit_um_s"]
@@ -164,14 +164,14 @@ def _finite(*given: Any) -> tuple[float, ...]:
     return numbers
 
 
-def _file(name: str, words: dict[str, str] | None = None) -> Response:
-    """A file of the page."""
+def _file(name: str, **words: str) -> Response:
+    """A file of the page, with these words in the place of their names."""
     suffix = name.rpartition(".")[2]
     # The name comes from a browser: it is looked up, never joined to a path.
     found = next((each for each in _PAGE.iterdir() if each.name == name), None)
     if found is None or suffix not in _TYPES:
         return PlainTextResponse("no such file\n", 404)
     text = found.read_text(encoding="utf-8")
-    for word, value in (words or {}).items():
+    for word, value in words.items():
         text = text.replace(f"{{{{{word}}}}}", value)
     return Response(text, media_type=_TYPES[suffix])

@@ -48,6 +48,7 @@ class Board:
     loop : of the server.
     over : the run has ended, and all pages that are awake can show it.
     left : no page is connected.
+    page_state : the state itself, which only the thread that hears the run changes.
     """
 
     def __init__(self, scene: Scene, name: str) -> None:
@@ -56,7 +57,7 @@ class Board:
         self.left.set()
         self.name = name
         self._pages = 0
-        self._page_state = PageState(scene)
+        self.page_state = PageState(scene)
         self._now = NOTHING
         self._events: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_MOST_EVENTS)
         self._changed = asyncio.Event()
@@ -69,15 +70,15 @@ class Board:
     def take(self, batch: Batch) -> None:
         """Take over what has happened."""
         _, drawing, picture, count, ended = self._now
-        for event in self._page_state.take(batch):
+        for event in self.page_state.take(batch):
             count += 1
             self._events.append((count, event))
-        new_drawing = self._page_state.drawing()
+        new_drawing = self.page_state.drawing()
         if new_drawing != drawing:
             drawing = new_drawing
         if self._pages:
-            picture = self._page_state.picture() or picture
-        self._now = PageContents(self._page_state.state(), drawing, picture, count, ended)
+            picture = self.page_state.picture() or picture
+        self._now = PageContents(self.page_state.state(), drawing, picture, count, ended)
         self._wake()
 
     def end(self, ended: RunEnded) -> None:
@@ -114,10 +115,6 @@ class Board:
         ticket = next(self._tickets)
         self._verdicts[ticket] = asyncio.get_running_loop().create_future()
         return ticket, self._verdicts[ticket]
-
-    def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
-        """The place on the chip that the image shows there."""
-        return self._page_state.chip_um(x_px, y_px)
 
     def enter(self) -> bool:
         """Count a page; False if there are too many."""

@@ -12,11 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Phase, Tick, printable, seconds, shift_px
-from flowrec.store import ChipCamera
-from flowrec.view import Batch, Scene, encode_jpeg, state_text
+from flowrec.core import Floats, Phase, Tick, printable, seconds, shift_px
+from flowrec.view import Batch, Scene, encode_jpeg, goal_of, state_text, way_of
 
 # What the page shows depends on these fields of a tick.
 SHOWN = ("frame", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing", "losses")
@@ -34,10 +32,6 @@ class PageState:
         self.tick = Tick()
         self.remarks: dict[str, Any] = {}
         self._scene = scene
-        left, top, right, bottom = scene.image_bounds()
-        size_px = round(right - left), round(bottom - top)
-        self._camera = ChipCamera(scene.calibration, size_px, scene.robot.radius_um)
-        self._image = self._camera.picture(None)
         self._walls_um = _outlines(scene)
         self._step = 1
 
@@ -49,30 +43,26 @@ class PageState:
             event = changes.get("event")
             if event is not None:
                 events.append({"s": round(seconds(event.stamp_ns), 2), "level": event.level, "text": event.text})
-            if changes.get("refined") is not None or changes.get("shift") is not None:
-                refined = self.tick.refined
-                self._image = self._camera.picture(None if refined is None else refined.registration, self.tick.shift)
         self._step, self.remarks = batch.step, batch.remarks
         return events
 
     def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
         """The place on the chip that the image shows there."""
-        x, y = (self._image.matrix @ np.array([x_px - 0.5, y_px - 0.5, 1.0])).tolist()
+        x, y = self._scene.from_plane(self._scene.image_to_plane(self.tick) @ (x_px, y_px, 1.0)).tolist()
         return x, y
 
     def drawing(self) -> Drawing:
         """Content that changes rarely: walls, route, goal; and the sizes."""
-        width, height = self._camera.size_px
-        route, mission = self.tick.route, self.tick.mission
-        goal = mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
+        left, top, right, bottom = self._scene.image_bounds()
+        goal = goal_of(self.tick.mission)
         return {
-            "width": width,
-            "height": height,
+            "width": round(right - left),
+            "height": round(bottom - top),
             "um_per_px": self._scene.calibration.um_per_px,
             "radius": round(self._scene.length_px(self._scene.robot.radius_um), 2),
             "top_speed": self._scene.robot.max_speed_um_s,
             "walls": [self._pixels(line) for line in self._walls_um],
-            "route": self._pixels(route.waypoints_um) if route is not None and route.reachable else [],
+            "route": self._pixels(way_of(self.tick.route)),
             "goal": None if goal is None else self._pixels(goal[None])[0],
             "goal_um": None if goal is None else [round(each) for each in goal.tolist()],
         }
@@ -115,12 +105,14 @@ class PageState:
             counts |= {"driver": losses.driver, "too late": losses.backlog}
         return [printable(f"{count} {what}") for what, count in counts.items() if count]
 
-    def _pixels(self, points_um: NDArray[np.float64]) -> list[list[float]]:
-        found: list[list[float]] = np.round(self._image.to_px(np.asarray(points_um, np.float64)), 1).tolist()
+    def _pixels(self, points_um: Floats) -> list[list[float]]:
+        to_image = self._scene.plane_to_image(self.tick)
+        pixels = self._scene.to_plane(points_um) @ to_image[:, :2].T + to_image[:, 2]
+        found: list[list[float]] = np.round(pixels, 1).tolist()
         return found
 
 
-def _outlines(scene: Scene) -> list[NDArray[np.float64]]:
+def _outlines(scene: Scene) -> list[Floats]:
     """The walls (n, 2) in um: outlines of the fluid, which go on beyond the mask at its openings."""
     padded = np.pad(scene.chip.mask.astype(np.uint8), _EDGE_PX, mode="edge")
     found, _ = cv2.findContours(padded, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)

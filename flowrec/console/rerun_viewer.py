@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import subprocess
-from collections.abc import AsyncIterator, Callable
-from contextlib import suppress
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing, closing, suppress
+from typing import Any
 
 import h11
 from starlette.requests import Request
@@ -69,73 +70,44 @@ class RerunViewer:
         body = await request.body()
         if len(body) > _LONGEST_REQUEST_BYTES:
             return PlainTextResponse("too long\n", 413)
+        answer = self._answer(self._port, request, body)
+        head = await anext(answer, None)
+        if head is None:
+            return PlainTextResponse("Rerun's server does not answer\n", 502)
+        named = ((name.decode(), value.decode()) for name, value in head.headers)
+        return _HandedOn(answer, head.status_code, {name: value for name, value in named if name.startswith(_KEPT)})
+
+    async def _answer(self, port: int, request: Request, body: bytes) -> AsyncGenerator[Any]:
+        """Ask Rerun's server: the head of its answer, then the rest as it comes; it ends where the server does."""
+        protocol = h11.Connection(h11.CLIENT)
+        asked = request.headers.items()
+        headers = [(name, value) for name, value in asked if name in ("content-type", "accept") or name[:5] == "grpc-"]
+        headers += [("x-grpc-web", "1"), ("host", f"{viewer.LOOPBACK}:{port}"), ("content-length", str(len(body)))]
+        head = h11.Request(method="POST", target=request.url.path, headers=headers)
         self._streams += 1
         try:
-            upstream = await _Upstream.request(self._port, request.url.path, request.headers.items(), body)
-        except (OSError, h11.RemoteProtocolError):
+            with suppress(OSError, h11.RemoteProtocolError):
+                reader, writer = await asyncio.open_connection(viewer.LOOPBACK, port)
+                with closing(writer):
+                    for event in (head, h11.Data(body), h11.EndOfMessage()):
+                        writer.write(protocol.send(event) or b"")
+                    await writer.drain()
+                    while isinstance(got := protocol.next_event(), h11.Response | h11.Data) or got is h11.NEED_DATA:
+                        if got is h11.NEED_DATA:
+                            protocol.receive_data(await reader.read(_CHUNK_BYTES))
+                        else:
+                            yield bytes(got.data) if isinstance(got, h11.Data) else got
+        finally:
             self._streams -= 1
-            return PlainTextResponse("Rerun's server does not answer\n", 502)
-        return _HandedOn(upstream, self._end_stream)
-
-    def _end_stream(self) -> None:
-        self._streams -= 1
-
-
-class _Upstream:
-    """One request to Rerun's server."""
-
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._reader, self._writer = reader, writer
-        self._protocol = h11.Connection(h11.CLIENT)
-        self.status, self.headers = 502, dict[str, str]()
-
-    @classmethod
-    async def request(cls, port: int, path: str, headers: list[tuple[str, str]], body: bytes) -> _Upstream:
-        """Send a request and wait for the head of the answer."""
-        self = cls(*await asyncio.open_connection(viewer.LOOPBACK, port))
-        kept = [(name, value) for name, value in headers if name in ("content-type", "accept") or name[:5] == "grpc-"]
-        kept += [("x-grpc-web", "1"), ("host", f"{viewer.LOOPBACK}:{port}"), ("content-length", str(len(body)))]
-        for event in (h11.Request(method="POST", target=path, headers=kept), h11.Data(body), h11.EndOfMessage()):
-            self._writer.write(self._protocol.send(event) or b"")
-        await self._writer.drain()
-        head = await self._event()
-        if not isinstance(head, h11.Response):
-            raise h11.RemoteProtocolError("no answer")
-        self.status = head.status_code
-        self.headers = {
-            name.decode(): value.decode() for name, value in head.headers if name.decode().startswith(_KEPT)
-        }
-        return self
-
-    async def body(self) -> AsyncIterator[bytes]:
-        """The rest of the answer as it comes."""
-        with suppress(OSError, h11.RemoteProtocolError):  # the run and its server have ended
-            while isinstance(event := await self._event(), h11.Data):
-                yield bytes(event.data)
-
-    def close(self) -> None:
-        """End the connection."""
-        self._writer.close()
-
-    async def _event(self) -> object:
-        while (event := self._protocol.next_event()) is h11.NEED_DATA:
-            self._protocol.receive_data(await self._reader.read(_CHUNK_BYTES))
-        return event
 
 
 class _HandedOn(StreamingResponse):
-    """The answer of Rerun's server; `ended` is called however it ends, also where a browser takes none of it."""
-
-    def __init__(self, upstream: _Upstream, ended: Callable[[], None]) -> None:
-        super().__init__(upstream.body(), upstream.status, upstream.headers)
-        self._upstream, self._ended = upstream, ended
+    """The answer of Rerun's server, which is closed however it ends, also where a browser takes none of it."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
+        assert isinstance(self.body_iterator, AsyncGenerator)
+        async with aclosing(self.body_iterator):
             await super().__call__(scope, receive, send)
-        finally:
-            self._upstream.close()
-            self._ended()
 
 
 def _program() -> dict[str, bytes]:

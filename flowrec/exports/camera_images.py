@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from flowrec.core import Applied, Frame, Image, SessionError, Tick, printable, seconds, without_none
+from flowrec.exports.formats import TimeProgress
 from flowrec.movies import MovieNotes
 from flowrec.store import Session
 
@@ -21,7 +22,7 @@ _DARKEST, _BRIGHTEST = 0.1, 99.9  # percentiles of grey levels that become black
 _OF_CAMERA = ("um_per_px", "angle_deg", "mirror", "centre_um", "exposure_s")  # settings that the images do not tell
 
 
-def with_images(session: Session, progress: Callable[[float], None] = lambda _: None) -> Iterator[tuple[Tick, Frame]]:
+def with_images(session: Session, progress: TimeProgress = lambda _: None) -> Iterator[tuple[Tick, Frame]]:
     """Ticks with a new image of the camera. Where the camera gave none, or the last one again, there is no row.
 
     `progress` takes the session time in s since the first tick, of each image that was taken.
@@ -95,19 +96,15 @@ class GreyScale:
     @classmethod
     def of(cls, session: Session, first: Frame) -> GreyScale:
         """That of a session."""
-        if first.bits <= 8:
-            return cls(8, 0, 255)
-        lows, highs = [], []
-        for share in np.linspace(0.0, 1.0, _SAMPLED):
-            begin, end = session.run.first_ns, session.run.last_ns
+        found = []
+        begin, end = session.run.first_ns, session.run.last_ns
+        for share in np.linspace(0.0, 1.0, _SAMPLED) if first.bits > 8 else ():
             frame = session.at(seconds(begin + round(share * (end - begin)))).frame
             levels = first.image if frame is None else frame.image
             seen = levels[levels > 0]  # 0 is also what lies outside of a recorded region
             if seen.size:
-                low, high = np.percentile(seen, (_DARKEST, _BRIGHTEST))
-                lows.append(low)
-                highs.append(high)
-        low, high = (int(min(lows)), int(np.ceil(max(highs)))) if lows else (0, 0)
+                found.append(np.percentile(seen, (_DARKEST, _BRIGHTEST)))
+        low, high = (int(np.min(found)), int(np.ceil(np.max(found)))) if found else (0, 0)
         return cls(first.bits, low, high) if high > low else cls(first.bits, 0, (1 << first.bits) - 1)
 
     def __call__(self, image: Image) -> NDArray[np.uint8]:

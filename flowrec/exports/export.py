@@ -51,20 +51,17 @@ def export(
     SessionError : the session can not be read, or the output not be written; OutputError if it may not be.
     """
     exporter: Exporter = EXPORTS[file_format].load()()
-    session = Session.of(session)
-    named = out is not None
-    second = None if beside is None else Session.of(beside)
-    if second is not None:
-        exporter = _beside(file_format, session, second)
-    target = _target(session, second, exporter.suffixes, file_format, out)
+    sessions = session, *others = _open_all(session, beside)
     facts = {"format": file_format, "session": session.path.name, "session_key": session.key}
-    inputs = _inputs(session, second)
-    if second is not None:
+    for second in others:
+        exporter = _beside(file_format, session, second)
         facts["beside_key"] = second.key
+    target = _target(sessions, exporter.suffixes, file_format, out)
+    inputs = _inputs(sessions)
     if exporter.folder:
         output: Output | OutputFolder = OutputFolder(target, facts, exporter.suffixes, inputs, overwrite)
     else:
-        before = "" if named else written_sha256(target, facts)
+        before = "" if out is not None else written_sha256(target, facts)
         output = Output(target, exporter.suffixes, inputs, overwrite, before)
     output.check()
     made_from = _made_from(inputs)  # before they are read: who changes them meanwhile gets a new one
@@ -90,14 +87,18 @@ def kept_rrd(
     session: Session | Path | str, out: Path | str | None = None, beside: Session | Path | str | None = None
 ) -> Path | None:
     """The .rrd that `export` made of the same sessions, if neither it, nor they, nor flowrec have changed since."""
-    session, second = Session.of(session), None if beside is None else Session.of(beside)
-    target = _target(session, second, RRD, "rrd", out)
-    made_from = _made_from(_inputs(session, second))
+    sessions = _open_all(session, beside)
+    target = _target(sessions, RRD, "rrd", out)
+    made_from = _made_from(_inputs(sessions))
     return target if made_from and is_as_written(target, {_MADE_FROM: made_from}) else None
 
 
-def _inputs(session: Session, second: Session | None) -> tuple[Path, ...]:
-    return tuple(files_behind(session.path)) + (() if second is None else tuple(files_behind(second.path)))
+def _open_all(session: Session | Path | str, beside: Session | Path | str | None) -> tuple[Session, ...]:
+    return tuple(Session.of(each) for each in (session, beside) if each is not None)
+
+
+def _inputs(sessions: tuple[Session, ...]) -> tuple[Path, ...]:
+    return tuple(path for each in sessions for path in files_behind(each.path))
 
 
 def _made_from(inputs: tuple[Path, ...]) -> str:
@@ -120,14 +121,10 @@ def _beside(file_format: str, session: Session, second: Session) -> Exporter:
     return RrdExport.of_pair(session, second)
 
 
-def _target(
-    session: Session, second: Session | None, suffixes: tuple[str, ...], file_format: str, out: Path | str | None
-) -> Path:
-    suffix = suffixes[0]
-    name = session.path.stem + (suffix or f"_{file_format}")
+def _target(sessions: tuple[Session, ...], suffixes: tuple[str, ...], file_format: str, out: Path | str | None) -> Path:
+    stems, suffix = [each.path.stem for each in sessions], suffixes[0] or f"_{file_format}"
     if out is None:
-        pair = "" if second is None else f"{session.path.stem}_and_{second.path.stem}{suffix}"
-        return named_beside(session.path, pair or name)
+        return named_beside(sessions[0].path, "_and_".join(stems) + suffix)
     out = Path(out)
-    within = suffix and out.is_dir() and out.suffix not in suffixes
-    return out / name if within else out
+    within = suffixes[0] and out.is_dir() and out.suffix not in suffixes
+    return out / f"{stems[0]}{suffix}" if within else out

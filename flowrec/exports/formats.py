@@ -9,6 +9,8 @@ from typing import Protocol
 from flowrec.core import Method, Methods
 from flowrec.store import Session
 
+TimeProgress = Callable[[float], None]  # takes the session time in s since the first tick
+
 EXPORTS = Methods(
     "--format",
     Method("rrd", "flowrec.exports.rrd:RrdExport", "a recording for Rerun, what flowrec view opens"),
@@ -52,7 +54,7 @@ class Exporter(Protocol):
     folder: bool
     advice: str
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         """Write a new file, or fill an empty folder, which gets its name when this returns.
 
         Parameters

@@ -56,10 +56,11 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
     foxglove.check()
     rerun.check()
     (width_m, height_m), px_m = (M_PER_UM * um for um in session.chip.size_um), M_PER_UM * session.chip.um_per_px
-    found = {
-        topic.path: plot_of(topic, next(session.messages(topic.path), None)) for topic in session.reader.topics.extra
+    plots = {
+        topic.path: plot
+        for topic in session.reader.topics.extra
+        if (plot := plot_of(topic, next(session.messages(topic.path), None))) is not None
     }
-    plots = {path: plot for path, plot in found.items() if plot is not None}
     centre_m = 0.5 * (width_m - px_m), 0.5 * (height_m - px_m)
     layout = foxglove_layout(centre_m, max(width_m, height_m), list(plots.values()))
     with SessionMetadata(session.run.files[0].path) as head:

@@ -10,7 +10,6 @@ more, the one before is shown longer. Without B-frames the file needs no edit li
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from fractions import Fraction
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import NS_PER_S, seconds
 from flowrec.exports.camera_images import GreyScale, first_frame, notes_of, refuse_windows, title_of, with_images
+from flowrec.exports.formats import TimeProgress
 from flowrec.movies import MovieNotes
 from flowrec.store import Session
 from flowrec.view import Overlay, Scene, WindowCompleter
@@ -47,7 +47,7 @@ class Mp4Export:
     folder = False
     advice = "open it with any player:"
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         first = first_frame(session)
         grey = GreyScale.of(session, first)
         size_px = first.image.shape[1], first.image.shape[0]
@@ -70,7 +70,7 @@ class PlainMp4Export:
     folder = False
     advice = "any player opens it; to make a session of it: flowrec import"
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         refuse_windows(session)
         first = first_frame(session)
         grey = GreyScale.of(session, first)

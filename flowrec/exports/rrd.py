@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from flowrec.core import DOUBTS, RRD, SessionError
+from flowrec.exports.formats import TimeProgress
 from flowrec.physics import Chip
 from flowrec.stages import ResolvedConfig, calibration_of
 from flowrec.store import Session, files_of
@@ -59,25 +59,25 @@ class RrdExport:
             raise SessionError(f"{second.path}: has another chip or camera than {first.path}; view them one by one")
         return cls(second)
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         scene = replace(
             scene_of(session.config, session.chip, session.path),
             key=session.key,
             doubts=str(session.outcome.get(DOUBTS, "")),
         )
-        prefixes: tuple[str, ...] = ("",)
-        sessions = [session]
+        shown = {"": session}
         parent = _parent_of(session)
         if self._second is not None:
-            prefixes, sessions = PAIR, [session, self._second]
+            shown = dict(zip(PAIR, (session, self._second), strict=True))
             summary = _pair(session, self._second)
         elif parent is not None:
-            prefixes, sessions = REPLAY, [Session(parent), session]
-            summary = _comparison(*sessions)
+            shown = dict(zip(REPLAY, (Session(parent), session), strict=True))
+            summary = _comparison(*shown.values())
         else:
             summary = document_of_run(session.path.stem, session.last, session.outcome)
-        ticks = [each.ticks(with_frames=each is sessions[0]) for each in sessions]
-        write_rrd(part, scene, dict(zip(prefixes, ticks, strict=True)), progress, summary)
+        first = next(iter(shown.values()))
+        ticks = {prefix: each.ticks(with_frames=each is first) for prefix, each in shown.items()}
+        write_rrd(part, scene, ticks, progress, summary)
 
 
 def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:
@@ -85,9 +85,8 @@ def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:
 
     pair = ReplayFiles.of(recorded, replayed)
     rows = before_after(pair)
-    planners = next((values for key, *values in rows if key == "planner"), [None, None])
-    hidden = {*_OF_COMMANDS, *(("planner",) if planners[0] == planners[1] else ())}
-    shown = [row for row in rows if row[0] not in hidden]
+    told = [row for row in rows if row[0] not in _OF_COMMANDS]
+    shown = [(key, was, now) for key, was, now in told if key != "planner" or was != now]
     return summary_document(["recorded", "replayed"], shown, [registration_remark(pair.replayed.refined)])
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from flowrec.core import SessionError, __version__, seconds, summary_of
+from flowrec.exports.formats import TimeProgress
 from flowrec.store import Session, field_values, observed_flow
 
 _RUN = "^[=+\\-@\t\r'＝＋－＠]"  # what a text begins with that a spreadsheet may take for a formula
@@ -32,10 +33,6 @@ _TYPES = (
     (pa.types.is_timestamp, "datetime"),
     (pa.types.is_string, "string"),
 )
-_MARKED = (
-    " A text that begins with = + - @, a tab, a return or an apostrophe has one more apostrophe before it, so that no "
-    "spreadsheet runs it."
-)
 _MEDIA_TYPES = {".parquet": "application/vnd.apache.parquet", ".csv": "text/csv"}
 
 
@@ -45,6 +42,7 @@ class _Tables:
     suffixes = ("",)
     folder = True
     suffix: str
+    remark = ""  # on the texts of its tables
 
     @abstractmethod
     def open_writer(self, path: Path, schema: pa.Schema) -> Any:
@@ -54,31 +52,27 @@ class _Tables:
         """The columns that the format holds."""
         return table
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
-        known = session.reader.topics
-        topics = [topic.field for topic in known.topics if session.topics.get(topic.path)]
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
+        topics = [topic for topic in session.reader.topics.topics if session.topics.get(topic.path)]
         if not topics:
             raise SessionError(f"{session.path}: holds no messages, so there are no tables; see flowrec info")
         begin_s = seconds(session.run.first_ns)
-        about: dict[str, tuple[pa.Schema, str]] = {}
+        resources: list[dict[str, Any]] = []
         with ExitStack() as stack:
             writers: dict[str, Any] = {}
             for topic in topics:
-                name, schema = _file_stem(topic) + self.suffix, self.select(session.schema(topic))
-                writers[topic] = stack.enter_context(self.open_writer(part / name, schema))
-                about[name] = (
-                    schema,
-                    f"{summary_of(known.by_field[topic].type)}; {known.by_field[topic].path}, a row a message",
-                )
-            for topic, batch in session.batches(topics):
-                writers[topic].write_batch(self.select(batch))
+                name, schema = _file_stem(topic.field) + self.suffix, self.select(session.schema(topic.field))
+                writers[topic.field] = stack.enter_context(self.open_writer(part / name, schema))
+                resources.append(_resource(name, schema, f"{summary_of(topic.type)}; {topic.path}, a row a message"))
+            for field, batch in session.batches(list(writers)):
+                writers[field].write_batch(self.select(batch))
                 progress(batch.column("time_s")[-1].as_py() - begin_s)
         for name, table, meaning in _places(session):
             with self.open_writer(part / (name + self.suffix), table.schema) as writer:
                 for batch in table.to_batches():
                     writer.write_batch(batch)
-            about[name + self.suffix] = table.schema, meaning
-        _write_datapackage(part, session, about)
+            resources.append(_resource(name + self.suffix, table.schema, meaning))
+        _write_datapackage(part, session, resources, self.remark)
 
 
 def _file_stem(topic: str) -> str:
@@ -117,19 +111,21 @@ class CsvExport(_Tables):
     """
 
     suffix = ".csv"
+    remark = (
+        " A text that begins with = + - @, a tab, a return or an apostrophe has one more apostrophe before it, so that "
+        "no spreadsheet runs it."
+    )
     advice = "a table a topic, for spreadsheets and everything else, is in"
 
     def open_writer(self, path: Path, schema: pa.Schema) -> Any:
-        flat = pa.schema([field if not pa.types.is_nested(field.type) else _text(field) for field in schema])
-        return pyarrow.csv.CSVWriter(path, flat)
+        return pyarrow.csv.CSVWriter(path, pa.schema([_text(field) for field in schema]))
 
     def select(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
         schema = table if isinstance(table, pa.Schema) else table.schema
         kept = [field for field in schema if not _is_raster(field.type)]
         if table is schema:
             return pa.schema(kept, metadata=schema.metadata)
-        columns = [table.column(field.name) for field in kept]
-        cells = [_cells(column) for column in columns]
+        cells = [_cells(table.column(field.name)) for field in kept]
         return pa.RecordBatch.from_arrays(cells, schema=pa.schema([_text(field) for field in kept]))
 
 
@@ -154,19 +150,18 @@ def _is_raster(kind: pa.DataType) -> bool:
     return bool(pa.types.is_float32(kind))
 
 
-def _write_datapackage(folder: Path, session: Session, tables: Mapping[str, tuple[pa.Schema, str]]) -> None:
+def _write_datapackage(folder: Path, session: Session, tables: list[dict[str, Any]], remark: str) -> None:
     """Write the description of a folder of tables, and beside it the settings and the chip of the session.
 
     Parameters
     ----------
-    tables : schema and description of each file, by its name in the folder.
+    tables : the description of each file.
     """
     header = session.header
     (folder / "config.toml").write_text(header.config_toml, encoding="utf-8")
     (folder / "chip.toml").write_text(header.chip_toml, encoding="utf-8")
     (folder / "chip.png").write_bytes(header.chip_png)
-    resources: list[dict[str, Any]] = [_resource(name, *about) for name, about in tables.items()]
-    resources += [
+    others = [
         {"name": "config", "path": "config.toml", "description": "settings of the run"},
         {"name": "chip", "path": "chip.png", "description": "mask of the chip: white is fluid"},
         {"name": "chip_openings", "path": "chip.toml", "description": "scale, openings and fluid of the chip"},
@@ -177,14 +172,13 @@ def _write_datapackage(folder: Path, session: Session, tables: Mapping[str, tupl
         "title": f"flowrec session {session.path.name}",
         "description": (
             "Chip frame: origin at the centre of the mask's pixel (0, 0), x right, y down. stamp_ns and time_s are "
-            "times on the session clock."
-        )
-        + (_MARKED if any(name.endswith(".csv") for name in tables) else ""),
+            f"times on the session clock.{remark}"
+        ),
         "sources": [{"title": session.path.name, "path": session.path.name}],
         "provenance": dict(session.provenance),
         "outcome": dict(session.outcome),
         "exported_by": f"flowrec {__version__}",
-        "resources": resources,
+        "resources": tables + others,
     }
     (folder / "datapackage.json").write_text(json.dumps(package, indent=1), encoding="utf-8")
 

@@ -7,7 +7,7 @@ compressed by Deflate with differences of neighbours, which every reader knows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import tifffile
 
 from flowrec.core import Image, SessionError, seconds
 from flowrec.exports.camera_images import GreyScale, first_frame, image_stamps, notes_of, title_of, with_images
+from flowrec.exports.formats import TimeProgress
 from flowrec.movies import NAMESPACE, MovieNotes
 from flowrec.store import Session
 
@@ -29,7 +30,7 @@ class TiffExport:
     folder = False
     advice = "open it with Fiji (Bio-Formats), napari or tifffile:"
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         first = first_frame(session)
         stamps = image_stamps(session)
         height, width = first.image.shape
@@ -51,7 +52,7 @@ class TiffExport:
             )
 
 
-def _images(session: Session, stamps: list[int], progress: Callable[[float], None]) -> Iterator[Image]:
+def _images(session: Session, stamps: list[int], progress: TimeProgress) -> Iterator[Image]:
     """The images that the file was made for, one after another."""
     number = 0
     for _, frame in with_images(session, progress):

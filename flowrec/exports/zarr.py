@@ -8,7 +8,6 @@ metadata; format 3 specifies neither yet. https://zarr-specs.readthedocs.io/en/l
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 import zarr
 
 from flowrec.core import SessionError, seconds
+from flowrec.exports.formats import TimeProgress
 from flowrec.store import Session, columns_of
 
 _CHUNK_BYTES = 8 << 20
@@ -34,7 +34,7 @@ class ZarrExport:
     folder = True
     advice = "open it with xarray.open_zarr:"
 
-    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         fields, frames = session.fields, session.frames
         if not fields and not len(frames):
             raise SessionError(f"{session.path}: holds neither images nor a flow field, which is what zarr takes")
@@ -53,7 +53,7 @@ class ZarrExport:
         zarr.consolidate_metadata(part, zarr_format=_FORMAT)
 
 
-def _write_frames(root: zarr.Group, session: Session, progress: Callable[[float], None]) -> None:
+def _write_frames(root: zarr.Group, session: Session, progress: TimeProgress) -> None:
     frames, start_unix_ns = session.frames, session.header.start_unix_ns
     stamps_ns = frames.stamps_ns
     coordinates: dict[str, tuple[Any, dict[str, Any]]] = {

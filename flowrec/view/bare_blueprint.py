@@ -12,10 +12,9 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 from flowrec.store import SLOTS
 from flowrec.view import colours
 from flowrec.view.bare_plots import EVENTS, IMAGE, MAPS, ON_IMAGE, PLOTS, STATES, Plot
-from flowrec.view.blueprint import LEGEND, events_view, existing, layout_of, legend_of, tabs
-from flowrec.view.entities import points
+from flowrec.view.blueprint import LEGEND, axis_of, events_view, existing, layout_of, legend_of, tabs
+from flowrec.view.entities import LOG_TIME, points
 
-_LOG_TIME = "message_log_time"  # Rerun's name for the time of an MCAP message
 _MISSION = "/run/mission"
 
 
@@ -29,7 +28,9 @@ def bare_blueprint(
     """
     camera = _picture("Camera: robot (orange), route (cyan), goal (green)", IMAGE, present, 1.2)
     maps = existing(_picture(name, topic, present, 0.9) for topic, name in MAPS.items())
-    axis = _axis(begin_ns, end_ns)
+    axis = axis_of(
+        *(rr.TimeRangeBoundary.absolute(nanos=ns) for ns in (begin_ns, end_ns + int(LEGEND * (end_ns - begin_ns))))
+    )
     groups = [
         [(SLOTS[plot.topic].schema.name, plot) for plot in each if plot.topic in present] for each in PLOTS.values()
     ]
@@ -42,7 +43,7 @@ def bare_blueprint(
     texts = rrb.Vertical(lanes, events_view(EVENTS), row_shares=[0.38, 0.62])
     below = rrb.Horizontal(texts, *plots, column_shares=[0.3, *(0.7 / len(plots) for _ in plots)])
     body = rrb.Vertical(rrb.Horizontal(*above, column_shares=[0.6, 0.4][: len(above)]), below, row_shares=[0.6, 0.4])
-    return layout_of(body if above else below, timeline=_LOG_TIME)
+    return layout_of(body if above else below, timeline=LOG_TIME)
 
 
 def _picture(name: str, topic: str, present: AbstractSet[str], width: float) -> rrb.View | None:
@@ -75,13 +76,6 @@ def _plot(plot: Plot, axis: rrb.TimeAxis, schema: str) -> rrb.View:
         plot_legend=legend_of(visible=len(plot.lines) > 1),
         axis_x=axis,
     )
-
-
-def _axis(begin_ns: int, end_ns: int) -> rrb.TimeAxis:
-    """The time of the recording, and some beyond it for a legend beside the curves."""
-    end_ns += int(LEGEND * (end_ns - begin_ns))
-    begin, end = (rr.TimeRangeBoundary.absolute(nanos=ns) for ns in (begin_ns, end_ns))
-    return rrb.TimeAxis(view_range=rr.TimeRange(start=begin, end=end))
 
 
 def _mapping(target: str, schema: str, field: str) -> VisualizerComponentMapping:

@@ -14,8 +14,7 @@ from rerun.blueprint.encodings import TimelineColumn
 from flowrec.core import seconds
 from flowrec.view import colours
 from flowrec.view import entities as e
-from flowrec.view.columns import FRAME, SESSION_TIME
-from flowrec.view.entities import entity_path, points
+from flowrec.view.entities import FRAME, SESSION_TIME, entity_path, points
 from flowrec.view.maps import ColourBar
 from flowrec.view.scene import Box, Scene
 
@@ -114,8 +113,7 @@ class _Views:
         end = rr.TimeRangeBoundary.absolute(seconds=(1.0 + LEGEND) * self.end_s)
         if self.live:
             end = rr.TimeRangeBoundary.cursor_relative(seconds=max(LEGEND * self.end_s, _LEGEND_LIVE_S))
-        start = rr.TimeRangeBoundary.absolute(seconds=0.0)
-        return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
+        return axis_of(rr.TimeRangeBoundary.absolute(seconds=0.0), end)
 
     def lanes(self) -> Shown:
         """The timeline of states."""
@@ -178,14 +176,14 @@ class _Views:
         height_px = _ALL_PX - self.below_px - _TITLE_PX
         return min(max((right - left) / (bottom - top) * height_px / _WIDTH_PX, 0.28), 0.62)
 
-    def layout(self, camera: Shown, maps: Iterable[Part], plots: Iterable[Part]) -> Shown:
+    def layout(self, camera: Shown, maps: Iterable[Part]) -> Shown:
         """Camera and maps above; below the summary, and beside it the states over the plots."""
         width = self.camera_share
         above: Shown = camera
         if beside := tabs(*maps):
             above = rrb.Horizontal(camera, beside, column_shares=[width, 1.0 - width])
         share = self.lanes_px / self.below_px
-        right_side = rrb.Vertical(*existing([self.lanes(), tabs(*plots)]), row_shares=[share, 1.0 - share])
+        right_side = rrb.Vertical(*existing([self.lanes(), tabs(*_plots(self))]), row_shares=[share, 1.0 - share])
         below = rrb.Horizontal(self.texts(), right_side, column_shares=[_SUMMARY, 1.0 - _SUMMARY])
         return rrb.Vertical(above, below, row_shares=[_ALL_PX - self.below_px, self.below_px])
 
@@ -199,7 +197,7 @@ def _single(v: _Views) -> Shown:
         ),
         v.pair({"truth": v.map("True flow", e.TRUE), "time to go": v.map("Time to go", e.TIME_TO_GO)}),
     )
-    return v.layout(camera, maps, _plots(v))
+    return v.layout(camera, maps)
 
 
 def _double(v: _Views) -> Shown:
@@ -221,7 +219,7 @@ def _double(v: _Views) -> Shown:
         v.pair({"uncertainty": uncertainty, "assumed": v.map("Assumed flow", e.ASSUMED, old)}),
         v.pair({"truth": v.map("True flow", e.TRUE, old), "time to go": to_go}),
     )
-    return v.layout(camera, maps, _plots(v))
+    return v.layout(camera, maps)
 
 
 def _plots(v: _Views) -> tuple[Part, ...]:
@@ -275,6 +273,11 @@ def events_view(paths: Iterable[str], timeline_columns: Sequence[TimelineColumn]
     """The events of some entities as a log."""
     columns = rrb.TextLogColumns(timeline_columns=timeline_columns, text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/", contents=_contents(paths), columns=columns)
+
+
+def axis_of(start: rr.TimeRangeBoundary, end: rr.TimeRangeBoundary) -> rrb.TimeAxis:
+    """The axis of a plot between two times."""
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
 
 
 def legend_of(*, visible: bool) -> rrb.PlotLegend:

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowrec.core import Floats
+
 Rgb = tuple[int, int, int]
 Table = Literal["speed", "uncertainty", "change", "time", "arrows"]
 
@@ -31,7 +33,7 @@ _LIGHT = np.array([(222, 236, 255), (255, 252, 214), (255, 236, 96)], np.float64
 _DIVERGING = np.array([(24, 78, 190), (116, 173, 240), (238, 238, 238), (244, 140, 96), (190, 24, 40)], np.float64)
 
 
-def _between(knots: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _between(knots: Floats) -> NDArray[np.uint8]:
     """(256, 3) colours between evenly spaced knots (n, 3)."""
     at, places = np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, len(knots))
     return np.stack([np.interp(at, places, channel) for channel in knots.T], 1).astype(np.uint8)

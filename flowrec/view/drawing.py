@@ -1,4 +1,7 @@
-"""Lines, arrows and letters on pictures (h, w, 3) in BGR. Lines have a dark rim: they are seen on light and on dark."""
+"""Pictures by OpenCV: the camera's images for people to look at, and lines, arrows and letters on them.
+
+Pictures are (h, w, 3) in BGR. Lines have a dark rim: they are seen on light and on dark.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,52 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import NS_PER_S
+from flowrec.core import NS_PER_S, Floats, Image
+from flowrec.store import nonzero_window
 from flowrec.view.colours import SOLID, Rgb
 
 Picture = NDArray[np.uint8]
-Points = NDArray[np.float64]
 SUBPIXEL_BITS = 4  # coordinates of OpenCV's lines are given in 1/16 px
+_DIMMING = 0.6  # factor on an older image, which shows that it is older
 _RIM = 0.75  # opacity of the rim
 _TRAIL_S = 4.0
 _FAR_PX = 1e5  # beyond it nothing is drawn
 _HEAD = 0.45  # length of an arrow's head over that of the arrow
 _HEAD_PX = (2.5, 6.0)  # least and largest, in widths of its line
 _ANGLE = np.linspace(0.0, 2.0 * np.pi, 33)
-CIRCLE: Points = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
-CROSS: tuple[Points, Points] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
+CIRCLE: Floats = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
+CROSS: tuple[Floats, Floats] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
+
+
+class WindowCompleter:
+    """Completes one image after the other where only a region was recorded (store/roi.py)."""
+
+    def __init__(self) -> None:
+        self._complete: Image | None = None  # the last image without a region, and the same dimmed
+        self._dimmed: Image | None = None
+
+    def complete(self, image: Image) -> Image:
+        """A recorded region (h, w) within the last complete image, which is dimmed."""
+        x0, y0, x1, y1 = nonzero_window(image)
+        if (x0, y0) == (0, 0) and (y1, x1) == image.shape:
+            self._complete, self._dimmed = image, None
+            return image
+        if self._complete is None or self._complete.shape != image.shape:
+            return image
+        if self._dimmed is None:
+            self._dimmed = (_DIMMING * self._complete).astype(image.dtype)
+        completed = self._dimmed.copy()
+        completed[y0:y1, x0:x1] = image[y0:y1, x0:x1]
+        return completed
+
+
+def encode_jpeg(image: Image, bits: int, quality: int) -> bytes:
+    """An image (h, w) of that many bits as JPEG, of its upper 8 bits."""
+    if bits > 8:
+        image = (image >> (bits - 8)).astype(np.uint8)
+    done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return jpeg.tobytes()
 
 
 class Trail:
@@ -32,9 +67,9 @@ class Trail:
 
     def __init__(self, step_px: float) -> None:
         self._step_px = step_px
-        self._points: deque[tuple[int, Points]] = deque()
+        self._points: deque[tuple[int, Floats]] = deque()
 
-    def add(self, stamp_ns: int, point: Points) -> list[Points]:
+    def add(self, stamp_ns: int, point: Floats) -> list[Floats]:
         """The points of the trail after another one (2,)."""
         kept = self._points
         if not kept or math.dist(kept[-1][1], point) >= self._step_px:
@@ -55,7 +90,7 @@ class Layer:
     def __init__(self, shape: tuple[int, int]) -> None:
         self._ink = np.zeros((*shape, 4), np.float32)  # BGR times opacity, and opacity
 
-    def lines(self, lines: Iterable[Points], heads: Iterable[Points], colour: Rgb, width_px: float) -> None:
+    def lines(self, lines: Iterable[Floats], heads: Iterable[Floats], colour: Rgb, width_px: float) -> None:
         """Polylines, each (n, 2) as x, y, and polygons that are filled."""
         polylines = [to_fixed_point(each) for each in lines if drawable(each)]
         polygons = [to_fixed_point(each) for each in heads]
@@ -88,40 +123,26 @@ class Layer:
         ink[inked] = ink[inked] * (1.0 - alpha) + alpha * np.array([*bgr(colour), 1.0], np.float32)
 
 
-def arrows(begins: Points, ends: Points, width_px: float) -> tuple[list[Points], list[Points]]:
+def arrows(begins: Floats, ends: Floats, width_px: float) -> tuple[list[Floats], list[Floats]]:
     """Shafts and heads, for `Layer.lines`, of arrows from `begins` to `ends`, both (n, 2)."""
-    shafts, heads = [], []
-    for begin, end in zip(begins, ends, strict=True):
-        length = float(np.hypot(*(end - begin)))
-        if not drawable(np.array([begin, end])) or length <= 0.0:
-            continue
-        along = (end - begin) / length
-        head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
-        across = 0.45 * head * np.array([-along[1], along[0]])
-        base = end - head * along
-        shafts.append(np.array([begin, base]))
-        heads.append(np.array([end, base + across, base - across]))
-    return shafts, heads
+    lengths = np.hypot(*(ends - begins).T)
+    shown = [drawable(each) for each in zip(begins, ends, strict=True)] & (lengths > 0.0)
+    begins, ends, lengths = begins[shown], ends[shown], lengths[shown, None]
+    along = (ends - begins) / lengths
+    head = np.clip(_HEAD * lengths, *np.multiply(_HEAD_PX, width_px))
+    across = 0.45 * head * np.column_stack((-along[:, 1], along[:, 0]))
+    bases = ends - head * along
+    return list(np.stack((begins, bases), 1)), list(np.stack((ends, bases + across, bases - across), 1))
 
 
-def draw_outline(picture: Picture, line: Points, colour: Rgb, width_px: float) -> None:
+def draw_outline(picture: Picture, line: Floats, colour: Rgb, width_px: float) -> None:
     """A polyline (n, 2) that is drawn for one image only."""
     for shade, rim in ((SOLID, 1.0), (colour, 0.0)):
         width = max(round(width_px + rim), 1)
         cv2.polylines(picture, [to_fixed_point(line)], False, bgr(shade), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
-    """Put letters, a mask of grey levels (h, w), on a picture of one colour; returns their width in px."""
-    rows, columns = max(picture.shape[0] - top, 0), max(picture.shape[1] - left, 0)
-    mask = mask[:rows, :columns]
-    part = picture[top : top + mask.shape[0], left : left + mask.shape[1]]
-    alpha = mask[..., None] * np.float32(1.0 / 255.0)
-    part[:] = part * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32) + 0.5
-    return int(mask.shape[1])
-
-
-def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) -> None:
+def restore(picture: Picture, clean: Picture, centre: Floats, radius_px: float) -> None:
     """Put the pixels of `clean` back within a circle."""
     mask = np.zeros(picture.shape[:2], np.uint8)
     x, y, radius = np.rint(np.array([*centre, radius_px]) * (1 << SUBPIXEL_BITS)).astype(int).tolist()
@@ -129,7 +150,7 @@ def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) 
     cv2.copyTo(clean, mask, picture)
 
 
-def to_fixed_point(points: Points) -> NDArray[np.int32]:
+def to_fixed_point(points: Floats) -> NDArray[np.int32]:
     """Points (n, 2) in 1/16 px, as OpenCV takes them."""
     return np.rint(points * (1 << SUBPIXEL_BITS)).astype(np.int32).reshape(-1, 1, 2)
 

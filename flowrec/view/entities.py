@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import rerun as rr
@@ -14,7 +15,12 @@ from rerun import new_entity_path
 
 from flowrec.view import colours
 from flowrec.view.colours import Rgb
-from flowrec.view.columns import FRAME, SESSION_TIME, ColumnBuffer
+
+SESSION_TIME = "session time"
+FRAME = "frame"
+LOG_TIME = "message_log_time"  # Rerun's name for the time of a message of an .mcap
+_ROWS = 64  # of an entity that wait at most
+_ENCODERS = 2  # threads
 
 MEASURED = "camera/measured"  # what is moved by the registration that a refinement found, and by the image's shift
 IMAGE = "camera/measured/image"
@@ -101,6 +107,54 @@ REPLAY, PAIR = ("recorded", "replayed"), ("A", "B")  # prefixes of two sessions 
 def entity_path(prefix: str, entity: str) -> str:
     """The entity's full path, escaped for Rerun; `prefix` is '' or one of REPLAY or PAIR."""
     return new_entity_path([part for part in (prefix, *entity.split("/")) if part])
+
+
+class ColumnBuffer:
+    """Rows that wait until there are many of an entity, or for `flush`: a call for one row costs more than the row.
+
+    In a file their order does not matter. As a context it ends its threads.
+    """
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._waiting: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
+        self._encoders = ThreadPoolExecutor(_ENCODERS)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._encoders.shutdown()
+
+    def encode(self, function: Callable[..., bytes], *given: Any) -> Future[bytes]:
+        """Call a function in another thread; the result may be a component of a row."""
+        return self._encoders.submit(function, *given)
+
+    def add(self, path: str, kind: Any, stamp_ns: int, frame: int | None, fields: dict[str, Sequence[Any]]) -> None:
+        """Take a row of an entity: a list of components for each field of the archetype `kind`."""
+        key = (path, kind, frame is None, *fields)
+        rows = self._waiting.setdefault(key, [])
+        rows.append((stamp_ns, frame, *fields.values()))
+        if len(rows) >= _ROWS:
+            self._send(key)
+
+    def flush(self) -> None:
+        """Send all rows."""
+        for key in [*self._waiting]:
+            self._send(key)
+
+    def _send(self, key: tuple[Any, ...]) -> None:
+        path, kind, frameless, *names = key
+        stamps_ns, frames, *fields = zip(*self._waiting.pop(key), strict=True)
+        indexes = [rr.TimeColumn(SESSION_TIME, duration=np.array(stamps_ns, "timedelta64[ns]"))]
+        if not frameless:
+            indexes.append(rr.TimeColumn(FRAME, sequence=frames))
+        columns: list[Any] = []
+        for name, lists in zip(names, fields, strict=True):
+            values = [value for components in lists for value in components]
+            components = [value.result() if isinstance(value, Future) else value for value in values]
+            columns += kind.columns(**{name: components}).partition([len(each) for each in lists])
+        rr.send_columns(path, indexes, columns, recording=self._stream, strict=True)
 
 
 class EntityLogger:

@@ -24,11 +24,10 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from flowrec.core import Frame, Tick, start_child
-from flowrec.view.viewer import leave
+from flowrec.view.viewer import last_line, leave, until
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
-_POLL_S = 0.02
 _AFTER_TICK_S = 0.001  # for the loop to end it
 _NO_IMAGE = np.zeros((0, 0), np.uint8)
 _FIELDS = tuple(field.name for field in fields(Tick))
@@ -120,8 +119,7 @@ class Feed:
     @property
     def last_words(self) -> str:
         """The last line that the process has written to its log."""
-        lines = [line for line in self._text().splitlines() if line.strip()]
-        return lines[-1] if lines else "it was killed"
+        return last_line(self._text()) or "it was killed"
 
     def has_logged(self, words: str) -> bool:
         """True if the process has written these words to its log."""
@@ -139,9 +137,8 @@ class Feed:
         self._ticked.set()
         end = time.monotonic() + timeout_s
         self._thread.join(timeout_s)
-        while self.process.poll() is None and not (stays and self.has_logged(stays)) and time.monotonic() < end:
-            time.sleep(_POLL_S)
-        staying = self.process.poll() is None and bool(stays) and self.has_logged(stays)
+        until(lambda: self.process.poll() is not None or self._stays(stays) or None, end - time.monotonic())
+        staying = self.process.poll() is None and self._stays(stays)
         if not staying:
             self.process.kill()  # SIGKILL also ends a stopped process, which unblocks the thread
             self.process.wait()
@@ -149,6 +146,9 @@ class Feed:
         with contextlib.suppress(OSError):  # Windows, while the process has it open
             self._log.unlink(missing_ok=True)
         return staying
+
+    def _stays(self, words: str) -> bool:
+        return bool(words) and self.has_logged(words)
 
     def _text(self) -> str:
         try:

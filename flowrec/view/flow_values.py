@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowField
+from flowrec.core import Bools, Floats, FlowField
 from flowrec.physics import sample
 from flowrec.view.colours import ColourScale, Table
 from flowrec.view.scene import Scene
 
-Floats = NDArray[np.float64]
 # Lengths in arrow spacings, unless stated otherwise.
 _ARROWS_ACROSS_IMAGE = (28.0, 45.0)  # along its width: for wide channels, and for narrow ones
 ARROWS_ACROSS_VIEW = (16.0, 21.0)  # the same in a view with other panels beside it
@@ -22,23 +21,23 @@ _WELL_AWAY = 0.45  # from the wall
 _PITCH = 0.2  # of the points that may carry an arrow
 
 
-def speed(field: FlowField, mask: NDArray[np.bool_]) -> Floats:
+def speed(field: FlowField, mask: Bools) -> Floats:
     """(h, w) um/s, NaN in solid."""
-    return np.where(mask, np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]), np.nan)
+    return np.where(mask, _length(field.velocity_um_s), np.nan)
 
 
 def peak(field: FlowField) -> float:
     """The largest speed, um/s."""
-    return float(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]).max())
+    return float(_length(field.velocity_um_s).max())
 
 
-def uncertainty(field: FlowField, mask: NDArray[np.bool_]) -> Floats:
+def uncertainty(field: FlowField, mask: Bools) -> Floats:
     """(h, w) one standard deviation of the velocity vector, um/s, NaN in solid."""
     assert field.std_um_s is not None
-    return np.where(mask, np.hypot(field.std_um_s[..., 0], field.std_um_s[..., 1]), np.nan)
+    return np.where(mask, _length(field.std_um_s), np.nan)
 
 
-def change(refined: FlowField, assumed: FlowField, mask: NDArray[np.bool_]) -> Floats:
+def change(refined: FlowField, assumed: FlowField, mask: Bools) -> Floats:
     """(h, w) speed of the refined flow minus that of the assumed one, um/s, NaN in solid."""
     return speed(refined, mask) - speed(assumed, mask)
 
@@ -63,11 +62,9 @@ def arrow_grid(scene: Scene, across: tuple[float, float] = _ARROWS_ACROSS_IMAGE)
     image_px = (image_right - image_left) * scene.calibration.um_per_px / chip.um_per_px  # of the mask
     few, many = across
     spacing = float(np.clip(width_px / _ARROWS_ACROSS_CHANNEL, image_px / many, image_px / few))
-    allowed = ridge | (wall_px >= _FROM_WALL * spacing)
-    pitch = max(1, int(_PITCH * spacing))
-    row, column = np.nonzero(allowed & chip.mask)
-    candidate = (row % pitch == 0) & (column % pitch == 0) | ridge[row, column]
-    row, column = row[candidate], column[candidate]
+    candidates, every = ridge.copy(), slice(None, None, max(1, int(_PITCH * spacing)))
+    candidates[every, every] |= wall_px[every, every] >= _FROM_WALL * spacing
+    row, column = np.nonzero(candidates & chip.mask)
     free = np.ones_like(chip.mask, np.uint8)
     chosen = []
     for at in np.lexsort((row, column, -np.round(np.minimum(wall_px[row, column], _WELL_AWAY * spacing)))):
@@ -86,10 +83,16 @@ def flow_arrows(scene: Scene, field: FlowField, grid: tuple[Floats, float]) -> t
     """
     points_um, spacing_um = grid
     velocity = sample(field, points_um)
-    magnitude = np.hypot(velocity[:, 0], velocity[:, 1])
+    magnitude = _length(velocity)
     fastest = float(np.quantile(magnitude, 0.99)) if len(magnitude) else 0.0
     longest = _LONGEST * scene.length_px(spacing_um)
     # Limited, so that a jet through a narrow spot does not cover its neighbours.
     relative = np.minimum(magnitude / fastest, 1.0) if fastest > 0.0 else np.zeros_like(magnitude)
     vectors = scene.directions(velocity * (longest * np.sqrt(relative) / np.maximum(magnitude, 1e-12))[:, None])
     return scene.to_plane(points_um) - 0.5 * vectors, vectors, magnitude
+
+
+def _length(vectors: NDArray[np.floating]) -> Floats:
+    """Length (...) of vectors (..., 2)."""
+    length: Floats = np.hypot(vectors[..., 0], vectors[..., 1])
+    return length

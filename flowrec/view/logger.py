@@ -6,15 +6,13 @@ import math
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from flowrec.core import (
-    CameraLosses,
     Currents,
     Demand,
-    Drops,
     Estimate,
     Event,
+    Floats,
     Frame,
     Health,
     Level,
@@ -24,19 +22,15 @@ from flowrec.core import (
     Route,
     Tick,
     Timing,
-    Track,
     message_fields,
     seconds,
 )
-from flowrec.physics import on_chip, sample
+from flowrec.physics import sample
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
-from flowrec.view.camera_pictures import WindowCompleter, encode_jpeg
-from flowrec.view.columns import ColumnBuffer
-from flowrec.view.drawing import CIRCLE, CROSS, Trail
-from flowrec.view.entities import EntityLogger, label, points
-from flowrec.view.flow_logger import FlowLogger
-from flowrec.view.scene import Scene
+from flowrec.view.drawing import CIRCLE, CROSS, Trail, WindowCompleter, encode_jpeg
+from flowrec.view.entities import ColumnBuffer, EntityLogger, label, points
+from flowrec.view.scene import Scene, goal_of, place_on_chip, way_of
 from flowrec.view.state_logger import StateLogger
 
 _JPEG_QUALITY = 85
@@ -56,7 +50,6 @@ class TickLogger:
 
     Parameters
     ----------
-    images : whether the camera's images are logged.
     speeds : scale of the maps; loggers that share it paint their maps alike.
     columns : see EntityLogger.
 
@@ -73,7 +66,6 @@ class TickLogger:
         scene: Scene,
         prefix: str = "",
         *,
-        images: bool = True,
         speeds: maps.SpeedScale | None = None,
         columns: ColumnBuffer | None = None,
     ) -> None:
@@ -83,17 +75,16 @@ class TickLogger:
         self._log, self._row, self._scalars = self._entities.log, self._entities.row, self._entities.scalars
         self.present = self._entities.present
         self._style = self._entities.style
-        self._images = images
         self._windows = WindowCompleter()
         self._placed_step = 0
-        self._flow = FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds)
+        self._flow = maps.FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds)
         self._tick = self._last = Tick()
         left, _, right, _ = scene.image_bounds()
         self._unit_px = (right - left) / _NOMINAL_PX
         self._trail = Trail(_TRAIL_STEP_PX * self._unit_px)
         self._robot_px = scene.length_px(scene.robot.radius_um)
         self.states = StateLogger(self._entities, doubtful=bool(scene.doubts))
-        self._placed = scene.image_to_plane(None)  # (2, 3) of the image
+        self._placed = scene.image_to_plane(self._tick)  # (2, 3) of the image
         outlines = rr.LineStrips2D(scene.outlines(), colors=colours.GREY, radii=points(0.6))
         self._log(e.OUTLINE, outlines, static=True)
         self._entities.log_styles()
@@ -104,7 +95,11 @@ class TickLogger:
         self._last, self._tick = self._tick, tick
         self._entities.set_time(tick.stamp_ns, tick.frame.index if tick.frame is not None else frame_index)
         if tick.refined is not self._last.refined or tick.shift is not self._last.shift:
-            self._log_registration(tick)
+            # The image moves as the registration that a refinement found, and the shift of a shaking stage, say.
+            placed = self._scene.image_to_plane(tick)
+            if not np.array_equal(placed, self._placed):
+                self._placed = placed
+                self._log(e.MEASURED, maps.transform_of(placed))
         self.states.end_marks(tick.stamp_ns)
         if tick.frame is not None and tick.frame is not self._last.frame:
             self._log_image(tick.frame)
@@ -118,16 +113,14 @@ class TickLogger:
 
     def _log_message(self, message: Message) -> None:
         """Log a new message of the last tick."""
+        self.states.log(message)
         match message:
             case Route():
                 self._log_route(message)
             case Mission():
                 last = self._last.mission
                 if last is None or not np.array_equal(message.goal_um, last.goal_um, equal_nan=True):
-                    self._log_goal(message.goal_um)
-                self.states.log_mission(message)
-            case Track():
-                self.states.log_sight(message)
+                    self._log_goal(goal_of(message))
             case Estimate():
                 self._log_estimate(message)
             case Demand():
@@ -138,7 +131,6 @@ class TickLogger:
                 self._scalars(e.FREQUENCY, message.frequency_hz)
                 self._scalars(e.HEADING, math.degrees(message.heading_rad))
             case Health():
-                self.states.log_alarm(message.alarm)
                 if math.isfinite(message.nis):
                     self._scalars(e.NIS_MEAN, message.nis)
                 self._scalars(e.PULSATION, 100.0 * message.pulsation_share)
@@ -148,13 +140,8 @@ class TickLogger:
             case Event():
                 self._log_text(e.EVENTS, message.text, _LEVELS.get(message.level, "INFO"))
             case OperatorEvent():
-                self.states.log_mark(message)
                 said = f": {message.text}" if message.text else ""
                 self._log_text(e.OPERATOR, f"operator: {message.action}{said}", "INFO")
-            case Drops():
-                self.states.log_drops(message)
-            case CameraLosses():
-                self.states.log_losses(message)
 
     def _log_extra(self, path: str, message: Message) -> None:
         """The floats of a message as lines over time, a vector as a line an element."""
@@ -166,7 +153,7 @@ class TickLogger:
                 self._scalars(f"{e.EXTRA}{path}/{each.name}", *values.tolist())
 
     def _log_image(self, frame: Frame) -> None:
-        if not self._images or frame.image.size == 0:
+        if self._style.second or frame.image.size == 0:  # the images of two sessions are those of the first
             return
         if self._placed_step != self.image_step:
             self._placed_step = self.image_step
@@ -179,15 +166,15 @@ class TickLogger:
 
     def _log_route(self, route: Route) -> None:
         self._flow.log_time_to_go(route)
-        if not route.reachable or len(route.waypoints_um) < 2:
+        path, style = self._scene.to_plane(way_of(route)), self._style
+        if not len(path):
             self._log(e.PATH, rr.LineStrips2D([]))
             return
-        path, style = self._scene.to_plane(route.waypoints_um), self._style
         order = 20.0 + style.second
         self._log(e.PATH, rr.LineStrips2D([path], colors=style.path, radii=points(style.width), draw_order=order))
 
-    def _log_goal(self, goal_um: NDArray[np.float64]) -> None:
-        if not np.isfinite(goal_um).all():
+    def _log_goal(self, goal_um: Floats | None) -> None:
+        if goal_um is None:
             self._entities.clear(e.GOAL)
             return
         centre = self._scene.to_plane(goal_um)
@@ -201,7 +188,7 @@ class TickLogger:
 
     def _log_estimate(self, estimate: Estimate) -> None:
         field, truth = self._tick.field, self._tick.truth
-        place_um = self._on_chip(estimate.position_um)
+        place_um = place_on_chip(self._tick, estimate.position_um)
         centre = self._scene.to_plane(place_um)
         colour = self._style.robot if estimate.seen else colours.PALE
         ring = [centre + self._robot_px * CIRCLE]
@@ -229,7 +216,7 @@ class TickLogger:
         if math.isfinite(estimate.nis):
             self._scalars(e.NIS, estimate.nis)
 
-    def _place_of_word(self, centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _place_of_word(self, centre: Floats) -> Floats:
         """Position of a word about the robot at which neither the view's border nor the second session's robot cuts it.
 
         Rerun centres it below the place.
@@ -253,22 +240,10 @@ class TickLogger:
         if self._tick.estimate is not None:
             length = _COMMAND_PX * self._unit_px / self._scene.robot.speed_limit_um_s
             vector = self._scene.directions(demand.velocity_um_s * length)
-            position = self._scene.to_plane(self._on_chip(self._tick.estimate.position_um))
+            position = self._scene.to_plane(place_on_chip(self._tick, self._tick.estimate.position_um))
             self._row(e.COMMAND, rr.Arrows2D, origins=[position], vectors=[vector])
 
     def _log_text(self, entity: str, text: str, level: str) -> None:
         # The time is in the text: a column of the view shows it to the nanosecond.
         whose = f"{self._entities.prefix}: " if self._entities.prefix else ""
         self._log(entity, rr.TextLog(f"{seconds(self._tick.stamp_ns):.1f} s  {whose}{text}", level=level))
-
-    def _log_registration(self, tick: Tick) -> None:
-        """Move the image as the registration that a refinement found, and the shift of a shaking stage, say."""
-        placed = self._scene.image_to_plane(tick.refined.registration if tick.refined is not None else None, tick.shift)
-        if not np.array_equal(placed, self._placed):
-            self._placed = placed
-            self._log(e.MEASURED, maps.transform_of(placed))
-
-    def _on_chip(self, measured_um: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Position on the chip of a measured point (2,) in um."""
-        refined = self._tick.refined
-        return on_chip(None if refined is None else refined.registration, measured_um)

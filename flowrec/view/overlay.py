@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Estimate, FlowField, Mission, Tick, shift_px
+from flowrec.core import Estimate, Floats, FlowField, Tick, shift_px
 from flowrec.view import colours
 from flowrec.view.colours import round_below
-from flowrec.view.drawing import CIRCLE, Layer, Picture, Points, Trail, arrows, draw_outline, drawable, restore
+from flowrec.view.drawing import CIRCLE, Layer, Picture, Trail, arrows, draw_outline, drawable, restore
 from flowrec.view.flow_values import arrow_grid, flow_arrows
-from flowrec.view.scene import Scene
+from flowrec.view.scene import Scene, goal_of, way_of
 from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, StatusBar
 
 _LEAST_WIDTH_PX = 480  # smaller images are enlarged by a whole factor, so that words and lines are readable
@@ -56,7 +56,7 @@ class Overlay:
         self._canvas = np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
         self._robot_px = self.zoom * scene.length_px(scene.robot.radius_um)
         self._grid = _sparser(*arrow_grid(scene))
-        self._to_image: NDArray[np.float64] = np.eye(2, 3)  # by the refined registration and the shift
+        self._to_image: Floats = np.eye(2, 3)  # by the refined registration and the shift
         self._trail = Trail(_TRAIL_STEP_PX * self._unit)
         um_per_px = scene.calibration.um_per_px / self.zoom
         self._status_bar = StatusBar((self.size_px[0], self.size_px[1] - self._height), letter, um_per_px)
@@ -79,31 +79,25 @@ class Overlay:
         canvas = self._canvas
         canvas[: self._height, : self._width] = picture
         canvas[: self._height, self._width :] = picture[:, -1:]
-        self._status_bar.draw(canvas[self._height :], tick.stamp_ns, tick.mission, tick.estimate)
+        self._status_bar.draw(canvas[self._height :], tick)
         return canvas
 
-    def _chip_to_px(self, points_um: Points) -> Points:
-        """Places on the chip to pixels of this picture."""
-        return self.zoom * self._image_points(self._scene.to_plane(points_um)) - 0.5
-
-    def _image_points(self, plane: Points) -> Points:
-        """Image positions of points (..., 2) of the picture plane."""
-        return plane @ self._to_image[:, :2].T + self._to_image[:, 2]
+    def _to_px(self, plane: Floats) -> Floats:
+        """Points (..., 2) of the picture plane to pixels of this picture."""
+        return self.zoom * (plane @ self._to_image[:, :2].T + self._to_image[:, 2]) - 0.5
 
     def _redraw(self, tick: Tick) -> Layer:
         """Draw what does not move: flow, route, goal, and the legend."""
-        layer, field, route = Layer((self._height, self._width)), tick.field, tick.route
-        registration = None if tick.refined is None else tick.refined.registration
-        inverse = cv2.invertAffineTransform(self._scene.image_to_plane(registration, tick.shift))
-        self._to_image = np.asarray(inverse, np.float64)
+        layer, field = Layer((self._height, self._width)), tick.field
+        self._to_image = self._scene.plane_to_image(tick)
         flow = None if field is None else self._draw_flow(layer, field, refined=tick.refined is not None)
-        path = self._chip_to_px(route.waypoints_um) if route is not None and route.reachable else np.zeros((0, 2))
-        has_route = len(path) > 1 and drawable(path)
+        path = self._to_px(self._scene.to_plane(way_of(tick.route)))
+        has_route = len(path) > 0 and drawable(path)
         if has_route:
             layer.lines([path], (), ROUTE, _LINE_PX * self._unit)
-        goal = _goal(tick.mission)
+        goal = goal_of(tick.mission)
         if goal is not None:
-            centre, reach = self._chip_to_px(np.array(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
+            centre, reach = self._to_px(self._scene.to_plane(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
             layer.lines([centre + reach * part for part in GOAL_SIGN], (), GOAL, _LINE_PX * self._unit)
         self._status_bar.set_legend(goal=goal is not None, route=has_route, flow=flow)
         return layer
@@ -116,7 +110,7 @@ class Overlay:
             return None
         fastest = float(np.quantile(speed[known], _FASTEST))
         px_per_speed = _LONGEST * self.zoom * self._scene.length_px(self._grid[1]) / fastest
-        middle = self.zoom * self._image_points((origins + 0.5 * vectors)[known]) - 0.5
+        middle = self._to_px((origins + 0.5 * vectors)[known])
         along = vectors[known] @ self._to_image[:, :2].T
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         half = 0.5 * px_per_speed * np.minimum(speed[known], 1.2 * fastest)[:, None] * along
@@ -143,21 +137,14 @@ class Overlay:
 
 def _content_key(tick: Tick) -> tuple[object, ...]:
     """Key of the content of a tick's layer: it is drawn anew where this changes."""
-    return id(tick.field), id(tick.route), _goal(tick.mission), shift_px(tick.shift)
+    goal = goal_of(tick.mission)
+    return id(tick.field), id(tick.route), None if goal is None else goal.tobytes(), shift_px(tick.shift)
 
 
-def _goal(mission: Mission | None) -> tuple[float, float] | None:
-    """Goal of the mission as (x, y) in um; None: no goal."""
-    if mission is None or not drawable(mission.goal_um):
-        return None
-    x, y = mission.goal_um.tolist()
-    return x, y
-
-
-def _sparser(points_um: Points, spacing_um: float) -> tuple[Points, float]:
+def _sparser(points_um: Floats, spacing_um: float) -> tuple[Floats, float]:
     """Every point of a grid, first come first served, that is far enough from those before; and their spacing."""
     spacing_um *= _SPARSER
-    chosen: list[Points] = []
+    chosen: list[Floats] = []
     for point in points_um:
         if not chosen or np.hypot(*(np.array(chosen) - point).T).min() >= spacing_um:
             chosen.append(point)

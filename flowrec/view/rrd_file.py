@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import itertools
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
@@ -14,8 +15,7 @@ import rerun as rr
 
 from flowrec.core import Tick, seconds
 from flowrec.view.blueprint import blueprint
-from flowrec.view.columns import ColumnBuffer
-from flowrec.view.entities import SUMMARY
+from flowrec.view.entities import SUMMARY, ColumnBuffer
 from flowrec.view.logger import TickLogger
 from flowrec.view.maps import SpeedScale
 from flowrec.view.scene import Scene
@@ -32,7 +32,7 @@ def write_rrd(
     path: Path,
     scene: Scene,
     ticks: Mapping[str, Iterable[Tick]],
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda _: None,
     summary: rr.TextDocument | None = None,
 ) -> None:
     """Write the ticks of a session, or of two in one view.
@@ -108,40 +108,31 @@ def _log_all(
     stream: rr.RecordingStream,
     scene: Scene,
     ticks: Mapping[str, Iterable[Tick]],
-    progress: Callable[[float], None] | None,
+    progress: Callable[[float], None],
     present: AbstractSet[str],
 ) -> None:
     describe(stream, scene)
-    prefixes, speeds = tuple(ticks), SpeedScale()
+    speeds = SpeedScale()
     first_ns: int | None = None
     stamp_ns = 0
     index: int | None = None
     with ColumnBuffer(stream) as columns:
-        loggers = [
-            TickLogger(stream, scene, prefix, images=prefix == prefixes[0], speeds=speeds, columns=columns)
-            for prefix in prefixes
-        ]
-        for count, (stamp_ns, number, tick) in enumerate(_merge(ticks.values())):
+        loggers = {prefix: TickLogger(stream, scene, prefix, speeds=speeds, columns=columns) for prefix in ticks}
+        first = next(iter(loggers.values()))
+        each = [zip(itertools.repeat(loggers[prefix]), found) for prefix, found in ticks.items()]
+        # In the order of stamps; of equal ones the first session's comes first.
+        for count, (logger, tick) in enumerate(heapq.merge(*each, key=lambda item: item[1].stamp_ns)):
+            stamp_ns = tick.stamp_ns
             first_ns = stamp_ns if first_ns is None else first_ns
-            if number == 0 and tick.frame is not None:
+            if logger is first and tick.frame is not None:
                 index = tick.frame.index
             # Replayed ticks may have no frame, but belong to a recorded one.
-            loggers[number].log(tick, frame_index=index)
-            if progress is not None and count % _PROGRESS_EVERY == 0:
+            logger.log(tick, frame_index=index)
+            if count % _PROGRESS_EVERY == 0:
                 progress(seconds(stamp_ns - first_ns))
         columns.flush()
-    present |= loggers[0].present
-    for prefix, logger in zip(prefixes[1:], loggers[1:], strict=True):
-        present |= {f"{prefix} {what}" for what in logger.present}
+    for prefix, logger in loggers.items():
+        present |= {what if logger is first else f"{prefix} {what}" for what in logger.present}
     # Last, when it is known which views are not empty. Rerun accepts it anywhere in the file.
-    phases = [logger.states.phases for logger in loggers]
-    stream.send_blueprint(blueprint(scene, prefixes, present, seconds(stamp_ns), phases))
-
-
-def _merge(sessions: Iterable[Iterable[Tick]]) -> Iterator[tuple[int, int, Tick]]:
-    """Stamp, number of the session and tick, in the order of stamps; of equal ones the first session's comes first."""
-
-    def label(number: int, ticks: Iterable[Tick]) -> Iterator[tuple[int, int, Tick]]:
-        return ((tick.stamp_ns, number, tick) for tick in ticks)
-
-    return heapq.merge(*(label(*each) for each in enumerate(sessions)), key=lambda item: item[:2])
+    phases = [logger.states.phases for logger in loggers.values()]
+    stream.send_blueprint(blueprint(scene, tuple(loggers), present, seconds(stamp_ns), phases))

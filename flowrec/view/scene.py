@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from flowrec.core import Matrix, Shift, shift_px
+from flowrec.core import Floats, Matrix, Mission, Route, Tick, shift_px
 from flowrec.physics import Calibration, Chip, Robot, on_chip
 
 _HALF_PX = 0.5
@@ -35,25 +35,32 @@ class Scene:
     camera_shape: tuple[int, int] | None = None  # (height, width) in px of the images that were tracked
     doubts: str = ""  # why the result is doubtful, as the session states it
 
-    def to_plane(self, points_um: ArrayLike) -> NDArray[np.float64]:
+    def to_plane(self, points_um: ArrayLike) -> Floats:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""
         return self.calibration.to_px(points_um) + _HALF_PX
 
-    def image_to_plane(self, registration: Matrix | None, shift: Shift | None = None) -> NDArray[np.float64]:
-        """(2, 3): where a point (x, y, 1) of the camera's image lies in the picture plane.
+    def image_to_plane(self, tick: Tick) -> Floats:
+        """(2, 3): where a point (x, y, 1) of the camera's image of a tick lies in the picture plane.
 
-        `registration` (2, 3) is that of a FlowField: of a measured place in um to the chip. None: as stated. `shift` is
-        that of the image; without it, the point is one as measured, from which the shift has been taken.
+        That is as stated, until a refinement has found another registration, or the image is shifted.
         """
-        off_px = shift_px(shift)
-        if registration is None and not any(off_px):
+        off_px = shift_px(tick.shift)
+        if _registration(tick) is None and not any(off_px):
             return np.eye(2, 3)
         corners = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
         measured_um = self.calibration.for_shift(off_px).to_um(corners - _HALF_PX)
-        moved = self.to_plane(on_chip(registration, measured_um))
+        moved = self.to_plane(place_on_chip(tick, measured_um))
         return np.column_stack((moved[1] - moved[0], moved[2] - moved[0], moved[0]))
 
-    def directions(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def plane_to_image(self, tick: Tick) -> Floats:
+        """(2, 3): the inverse of `image_to_plane`."""
+        return np.asarray(cv2.invertAffineTransform(self.image_to_plane(tick)), np.float64)
+
+    def from_plane(self, places: Floats) -> Floats:
+        """The picture plane (..., 2) to chip coordinates (..., 2) in um."""
+        return self.calibration.to_um(places - _HALF_PX)
+
+    def directions(self, vectors: Floats) -> Floats:
         """Vectors (..., 2) along the chip's axes as vectors of the same length in the picture plane."""
         return vectors @ self.calibration.axes.T
 
@@ -70,7 +77,7 @@ class Scene:
         """(2, 3): the same for a camera image of which only each `step`-th row and column is shown."""
         return np.column_stack((step * np.eye(2), np.full(2, _HALF_PX * (1 - step))))
 
-    def outlines(self) -> list[NDArray[np.float64]]:
+    def outlines(self) -> list[Floats]:
         """The walls in the picture plane: closed lines (n, 2) along the border of the mask."""
         contours, _ = cv2.findContours(self.chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         return [self.to_plane(np.concatenate([c, c[:1]])[:, 0] * self.chip.um_per_px) for c in contours]
@@ -104,3 +111,24 @@ class Scene:
             return self.chip_bounds()
         width, height = self.image_px
         return 0.0, 0.0, float(width), float(height)
+
+
+def place_on_chip(tick: Tick, measured_um: Floats) -> Floats:
+    """Places on the chip of measured points (..., 2), in um, by the registration that a refinement found."""
+    return on_chip(_registration(tick), measured_um)
+
+
+def _registration(tick: Tick) -> Matrix | None:
+    return None if tick.refined is None else tick.refined.registration
+
+
+def goal_of(mission: Mission | None) -> Floats | None:
+    """Goal (2,) of a mission on the chip, in um; None: none was set."""
+    return mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
+
+
+def way_of(route: Route | None) -> Floats:
+    """Points (n, 2) of a route on the chip, in um; none of one that leads nowhere."""
+    if route is None or not route.reachable or len(route.waypoints_um) < 2:
+        return np.empty((0, 2))
+    return route.waypoints_um

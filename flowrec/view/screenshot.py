@@ -15,9 +15,8 @@ from rerun.experimental import ViewerClient, ViewerState
 from flowrec.core import PICTURE, FlowrecError, Output, nanoseconds
 from flowrec.store import ForeignError, SessionMetadata
 from flowrec.view import viewer
-from flowrec.view.columns import SESSION_TIME
+from flowrec.view.entities import LOG_TIME, SESSION_TIME
 
-_LOG_TIME = "message_log_time"  # Rerun's name for the session clock of an .mcap
 _START_S = 20.0
 _LOAD_S = 60.0
 _SETTLE_S = 1.0  # images are decoded and plots laid out over some frames
@@ -56,9 +55,9 @@ def screenshot(
         if SESSION_TIME in ends_ns:
             at_ns = (ends_ns[SESSION_TIME] or 0) if time_s is None else nanoseconds(time_s)
             client.set_time(SESSION_TIME, duration=np.timedelta64(at_ns, "ns"), play_state="paused")
-        elif _LOG_TIME in ends_ns and time_s is not None:
+        elif LOG_TIME in ends_ns and time_s is not None:
             at_ns = _start_unix_ns(path) + nanoseconds(time_s)
-            client.set_time(_LOG_TIME, timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
+            client.set_time(LOG_TIME, timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
         time.sleep(max(_SETTLE_S, began + _NOTICES_S - time.monotonic()))
         part.write_bytes(client.take_screenshot())
         return [
@@ -127,5 +126,4 @@ def _why(log: Path) -> str:
         return (
             "it has no graphics to draw with: install a driver, or `apt install mesa-vulkan-drivers` for a software one"
         )
-    lines = [line for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "its log is empty"
+    return viewer.last_line(text) or "its log is empty"

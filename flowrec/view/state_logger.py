@@ -4,7 +4,20 @@ from __future__ import annotations
 
 import rerun as rr
 
-from flowrec.core import NS_PER_S, Action, Alarm, CameraLosses, Drops, Mission, OperatorEvent, Outcome, Phase, Track
+from flowrec.core import (
+    NS_PER_S,
+    Action,
+    Alarm,
+    CameraLosses,
+    Drops,
+    Health,
+    Message,
+    Mission,
+    OperatorEvent,
+    Outcome,
+    Phase,
+    Track,
+)
 from flowrec.view import colours
 from flowrec.view import entities as e
 from flowrec.view.colours import Rgb
@@ -39,7 +52,27 @@ class StateLogger:
         self._colours: dict[str, dict[str, Rgb]] = {}  # of the states of each lane so far
         self._mark_ends_ns: int | None = None
 
-    def log_mission(self, mission: Mission) -> None:
+    def log(self, message: Message) -> None:
+        """Log the state that a new message tells, if it tells one."""
+        match message:
+            case Mission():
+                self._log_mission(message)
+            case Track():
+                self._log_state(e.SIGHT, _NONE if message.seen else "Not seen", colours.RED)
+            case Health():
+                words = [_ALARMS.get(word, word) for word in message.alarm.split("; ") if word]
+                self._log_state(e.ALARM, ", ".join(word for word in words if word), colours.RED)
+            case OperatorEvent(action=action, text=said):
+                text = f"{action} {said}" if action in (Action.GOAL, Action.SPEED) else said
+                self._mark_ends_ns = message.stamp_ns + _MARK_NS
+                self._log_state(e.MARKS, text[:_LETTERS] if action in _WITH_TEXT and said else action, colours.CYAN)
+            case Drops(kept_every=every) if message.by_backlog or message.by_camera or every > 1:
+                thinned = f", every {every}. kept" if every > 1 else ""
+                self._log_state(e.LOSSES, f"{message.by_backlog + message.by_camera} lost{thinned}", colours.RED)
+            case CameraLosses() if message.ids > message.frames:
+                self._log_state(e.LOSSES, f"{message.ids - message.frames} lost before the loop", colours.RED)
+
+    def _log_mission(self, mission: Mission) -> None:
         """The phase, and at the end the outcome."""
         name, colour = mission.phase, _PHASE_COLOURS.get(mission.phase, colours.GREY)
         if mission.finished and mission.outcome:
@@ -49,34 +82,6 @@ class StateLogger:
         if len(self.phases) < _PHASES:
             self.phases.setdefault(name, mission.since_ns)
         self._log_state(e.PHASE, name.capitalize(), colour)
-
-    def log_sight(self, track: Track) -> None:
-        """The robot is not seen: nothing is drawn while it is."""
-        self._log_state(e.SIGHT, _NONE if track.seen else "Not seen", colours.RED)
-
-    def log_alarm(self, alarm: str) -> None:
-        """Alarms of the observer: words of enums.Alarm, separated by "; "."""
-        words = [_ALARMS.get(word, word) for word in alarm.split("; ") if word]
-        self._log_state(e.ALARM, ", ".join(word for word in words if word), colours.RED)
-
-    def log_mark(self, event: OperatorEvent) -> None:
-        """A mark or another action of the operator."""
-        said = f"{event.action} {event.text}" if event.action in (Action.GOAL, Action.SPEED) else event.text
-        text = said[:_LETTERS] if event.action in _WITH_TEXT and event.text else event.action
-        self._mark_ends_ns = event.stamp_ns + _MARK_NS
-        self._log_state(e.MARKS, text, colours.CYAN)
-
-    def log_drops(self, drops: Drops) -> None:
-        """Images that are not recorded."""
-        if drops.by_backlog or drops.by_camera or drops.kept_every > 1:
-            thinned = f", every {drops.kept_every}. kept" if drops.kept_every > 1 else ""
-            self._log_state(e.LOSSES, f"{drops.by_backlog + drops.by_camera} lost{thinned}", colours.RED)
-
-    def log_losses(self, losses: CameraLosses) -> None:
-        """Images that the camera made and the loop did not get."""
-        lost = losses.ids - losses.frames
-        if lost > 0:
-            self._log_state(e.LOSSES, f"{lost} lost before the loop", colours.RED)
 
     def end_marks(self, stamp_ns: int) -> None:
         """End a mark whose time is over."""
@@ -88,9 +93,8 @@ class StateLogger:
         if state == self._now.get(lane, _NONE):
             return
         self._now[lane] = state
-        known = self._colours.setdefault(lane, {})
+        known = self._colours.setdefault(lane, {_NONE: colour})
         if state not in known and len(known) < _STATES:
-            known.setdefault(_NONE, colour)
             known[state] = colour
             shown = rr.StateConfiguration(
                 values=list(known),

@@ -14,10 +14,10 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
-from flowrec.core import Estimate, Mission, printable, seconds
+from flowrec.core import Estimate, Floats, Mission, Tick, printable, seconds
 from flowrec.view import colours
 from flowrec.view.colours import Rgb, round_below
-from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, Points, arrows, bgr, draw_mask
+from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, arrows, bgr
 
 ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
 _TEXT, _GROUND = colours.WHITE, (24, 24, 28)
@@ -70,13 +70,13 @@ class StatusBar:
             self._parts.append(self._part(tip[0, 0], f"{words} {speed:g} µm/s", FLOW, *arrow, width=0.8))
         self._parts.append(self._scale_bar())
 
-    def draw(self, bar: Picture, stamp_ns: int, mission: Mission | None, estimate: Estimate | None) -> None:
+    def draw(self, bar: Picture, tick: Tick) -> None:
         """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first."""
         bar[:] = bgr(_GROUND)
         left = round(0.6 * self._letter)
-        left += draw_mask(bar, _clock_mask(clock_text(seconds(stamp_ns)), self._letter), left, self._top, _TEXT)
+        left += self._write(bar, _clock_mask(clock_text(seconds(tick.stamp_ns)), self._letter), left)
         left += round(0.9 * self._letter)
-        left += draw_mask(bar, _text_mask(state_text(mission, estimate), self._letter), left, self._top, _TEXT)
+        left += self._write(bar, _text_mask(state_text(tick.mission, tick.estimate), self._letter), left)
         right = bar.shape[1]
         for part in reversed(self._parts):
             begin = right - part.shape[1]
@@ -97,8 +97,8 @@ class StatusBar:
         sign_px: float,
         words: str,
         colour: Rgb,
-        lines: Sequence[Points],
-        heads: Sequence[Points] = (),
+        lines: Sequence[Floats],
+        heads: Sequence[Floats] = (),
         width: float = 1.0,
     ) -> Picture:
         """A sign of some px in the given colour, by `Layer.lines`, with its words to the right of it."""
@@ -106,11 +106,19 @@ class StatusBar:
         sign = math.ceil(sign_px)
         picture = np.empty((self._height, sign + gap + mask.shape[1] + round(1.2 * self._letter), 3), np.uint8)
         picture[:] = bgr(_GROUND)
-        draw_mask(picture, mask, sign + gap, self._top, _TEXT)
+        self._write(picture, mask, sign + gap)
         layer = Layer(picture.shape[:2])
         layer.lines(lines, heads, colour, width * self._line)
         layer.blend(picture[..., 0].copy(), picture)
         return picture
+
+    def _write(self, picture: Picture, mask: Picture, left: int) -> int:
+        """Put letters, a mask of grey levels (h, w), on a picture of one colour; returns their width in px."""
+        part = picture[self._top :, left:][: mask.shape[0], : mask.shape[1]]
+        mask = mask[: part.shape[0], : part.shape[1]]
+        alpha = mask[..., None] * np.float32(1.0 / 255.0)
+        part[:] = part * (1.0 - alpha) + alpha * np.array(bgr(_TEXT), np.float32) + 0.5
+        return int(mask.shape[1])
 
 
 def clock_text(time_s: float) -> str:
@@ -175,5 +183,5 @@ def _clock_mask(text: str, height_px: int) -> Picture:
     for letter in text:
         mask = _text_mask(letter, height_px)
         missing = widest - mask.shape[1] if letter in _DIGITS else 0
-        parts.append(np.pad(mask, ((0, 0), (missing // 2, missing - missing // 2))) if missing else mask)
+        parts.append(np.pad(mask, ((0, 0), (missing // 2, missing - missing // 2))))
     return np.hstack(parts)

@@ -21,7 +21,7 @@ from flowrec.core import (
 )
 from flowrec.physics import on_chip
 from flowrec.stages import MotionOfRun, RunStatistics, TrackQuality, figures_of
-from flowrec.view.scene import Scene
+from flowrec.view.scene import Scene, goal_of
 
 _MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\`*_{}[]()<>#+!|~"})
 _LETTERS = 200  # of one cell: names and notes come from the file
@@ -58,9 +58,10 @@ def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Itera
 
 def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
     """Goal and figures of one run; those that are not known are left out."""
-    goal: list[Row] = [("goal", _place(last), None)]
+    goal_um = goal_of(last.mission)
+    goal: Row = ("goal", "none" if goal_um is None else f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um", None)
     known = [key for key in FIGURES if figures.get(key) not in (None, "")]
-    return goal + [(key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO]
+    return [goal, *((key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO)]
 
 
 def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.TextDocument:
@@ -137,13 +138,6 @@ def registration_remark(refined: FlowField | None) -> str:
     middle_um = 0.5 * refined.um_per_px * np.array([width - 1.0, height - 1.0])
     x_um, y_um = (on_chip(refined.registration, middle_um) - middle_um).tolist()
     return f"Found registration: picture moved by ({x_um:.1f}, {y_um:.1f}) um"
-
-
-def _place(last: Tick) -> str:
-    goal = last.mission.goal_um if last.mission is not None else None
-    if goal is None or not np.isfinite(goal).all():
-        return "none"
-    return f"({goal[0]:.0f}, {goal[1]:.0f}) um"
 
 
 def _cell(text: str) -> str:

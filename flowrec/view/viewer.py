@@ -126,6 +126,11 @@ def open_window(*arguments: str) -> subprocess.Popen[bytes]:
     return start(["--port", "auto", "--hide-welcome-screen", *arguments])
 
 
+def last_line(log: str) -> str:
+    """The last line of a log that is not blank; '' if there is none."""
+    return next((line for line in reversed(log.splitlines()) if line.strip()), "")
+
+
 def leave(process: subprocess.Popen[bytes]) -> None:
     """Let a process outlive this one; if it ends before, it leaves no entry in the table of processes."""
     threading.Thread(target=process.wait, name="outlives", daemon=True).start()

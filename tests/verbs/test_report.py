@@ -273,7 +273,7 @@ def test_a_long_curve_is_thinned_to_its_range_and_gaps_and_nan_interrupt_it() ->
 
 
 def test_a_point_of_a_thinned_curve_is_the_mean_of_its_values() -> None:
-    builder = CurveBuilder(0, 1_000_000_000, buckets=2)
+    builder = CurveBuilder(0, BUCKETS * 500_000_000)  # a bucket is half a second
     for place, value in ((0, 1.0), (100, 2.0), (200, 6.0), (700, -4.0)):
         builder.add(place * 1_000_000, value)
     curve = builder.curve()

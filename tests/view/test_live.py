@@ -22,8 +22,8 @@ from flowrec.core.messages import Frame
 from flowrec.core.topics import Tick
 from flowrec.exports.rrd import scene_of
 from flowrec.store.session import Session
-from flowrec.view import live_server, viewer
-from flowrec.view.live import LiveView
+from flowrec.view import viewer
+from flowrec.view.live import ABSENT_S, LiveView
 from flowrec.view.scene import Scene
 from flowrec.view.summary_text import LiveSummary, document_of_run
 from tests.conftest import HANG_S, until
@@ -120,7 +120,7 @@ def test_a_viewer_receives_every_tick_and_a_smaller_image_and_its_server_stays_u
         live.close(HANG_S)
     # A viewer calls the end of its server an error: the server stays until the last one has left.
     assert f"its server (process {live.pid}) stays" in live.afterwards
-    time.sleep(1.5 * live_server.ABSENT_S)
+    time.sleep(1.5 * ABSENT_S)
     assert sockets(live.pid or 0)  # it accepts viewers still
     assert listener.poll() is None
     listener.send_signal(signal.SIGINT)

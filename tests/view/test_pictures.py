@@ -18,8 +18,8 @@ from flowrec.physics.chip.registration import Calibration
 from flowrec.physics.flow.sampling import sample
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.view import colours, flow_values, maps
-from flowrec.view.camera_pictures import WindowCompleter
 from flowrec.view.colours import ColourScale
+from flowrec.view.drawing import WindowCompleter
 from flowrec.view.entities import TIME_TO_GO
 from flowrec.view.feed import Batch
 from flowrec.view.flow_values import arrow_grid, flow_arrows

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowrec.core import Floats, FlowField
 from flowrec.exports.report import style
 from flowrec.exports.report.curves import Curve
-from flowrec.exports.report.history import std_at
 from flowrec.exports.report.report_data import ReportData
 from flowrec.exports.report.time_axis import line, observation_points, panels, shown_observations
 from flowrec.physics import sample
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 _EXPECTED_NIS = 2.0  # of a two-dimensional measurement
 _RECORDING_PANEL_MM = 20.0
 
@@ -206,11 +204,11 @@ class PathFlowFigure:
         path_um, time_s = data.path_um, history.curve("x_um").time_s
         line(ax, _speed_of(data, "true"), style.INK, "true (simulated)", lw=0.7)
         if data.assumed is not None:
-            speed = _speed(sample(data.assumed, path_um), path_um)
+            speed = _speed(data.assumed, path_um)
             ax.plot(time_s, speed, color=style.QUIET, ls=(0, (4, 2)), label="assumed")
         top = 0.0
         if data.refined is not None:
-            speed, std = _speed(sample(data.refined, path_um), path_um), std_at(data.refined, path_um)
+            speed, std = _speed(data.refined, path_um), _std(data.refined, path_um)
             ax.fill_between(time_s, np.maximum(speed - std, 0.0), speed + std, color=style.ORANGE, alpha=0.3, lw=0.0)
             ax.plot(time_s, speed, color=style.ORANGE, lw=1.3, label="refined")
             top = float(np.nanmax(speed, initial=0.0))
@@ -302,12 +300,26 @@ def _speed_of(data: ReportData, name: str) -> Curve:
 def _limit(ax: Axes, curves: list[Curve]) -> None:
     """Limits by the curves: the first standard deviations of an observer are as wide as can be."""
     known = np.concatenate([curve.known for curve in curves])
-    if len(known):
-        low, high = min(float(known.min()), 0.0), max(float(known.max()), 0.0)
-        margin = 0.15 * max(high - low, 1.0)
-        ax.set_ylim(low - margin, high + margin)
+    low, high = known.min(initial=0.0), known.max(initial=0.0)
+    margin = 0.15 * max(high - low, 1.0)
+    ax.set_ylim(low - margin, high + margin)
 
 
-def _speed(velocity: Floats, at_um: Floats) -> Floats:
-    speed: Floats = np.where(np.isfinite(at_um[:, 0]), np.hypot(velocity[:, 0], velocity[:, 1]), np.nan)
+def _speed(field: FlowField, at_um: Floats) -> Floats:
+    """Speed (n,) of a map at points (n, 2), um/s; NaN where a point is not known."""
+    speed: Floats = np.where(np.isfinite(at_um[:, 0]), np.hypot(*sample(field, at_um).T), np.nan)
     return speed
+
+
+def _std(field: FlowField, at_um: Floats) -> Floats:
+    """One standard deviation (n,) of the velocity vector of a map at points (n, 2), um/s: of the nearest pixel.
+
+    NaN where the map states none, and outside of the mask's image.
+    """
+    if field.std_um_s is None:
+        return np.full(len(at_um), np.nan)
+    std = np.hypot(*np.moveaxis(field.std_um_s, -1, 0))
+    pixels = np.rint(at_um / field.um_per_px)
+    inside = (pixels >= 0.0).all(axis=1) & (pixels < std.shape[::-1]).all(axis=1)
+    column, row = np.where(inside[:, None], pixels, 0.0).astype(np.intp).T
+    return np.where(inside, std[row, column], np.nan)

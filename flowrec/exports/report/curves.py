@@ -6,15 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import seconds
+from flowrec.core import Floats, seconds
 
 BUCKETS = 600  # of 0.3 mm in the widest figure
 _MOST_SPANS = 200
 _GAP = 4.0  # of the usual interval of values: a longer one interrupts the line
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,36 +51,25 @@ class CurveBuilder:
     first_ns, last_ns : stamps between which the values lie.
     """
 
-    def __init__(self, first_ns: int, last_ns: int, buckets: int = BUCKETS) -> None:
+    def __init__(self, first_ns: int, last_ns: int) -> None:
         self._first_ns = first_ns
-        self._per_ns = buckets / max(last_ns - first_ns, 1)
-        self._last = buckets - 1
-        self._count = [0] * buckets
-        self._time_s = [0.0] * buckets
-        self._mean = [0.0] * buckets
-        self._low = [math.inf] * buckets
-        self._high = [-math.inf] * buckets
+        self._per_ns = BUCKETS / max(last_ns - first_ns, 1)
+        self._rows: dict[int, tuple[int, float, float, float, float]] = {}  # number, time, mean, low, high by bucket
 
     def add(self, stamp_ns: int, value: float) -> None:
         """Take a value."""
         if not math.isfinite(value):
             return
-        at = min(max(int((stamp_ns - self._first_ns) * self._per_ns), 0), self._last)
-        self._count[at] += 1
+        at = min(max(int((stamp_ns - self._first_ns) * self._per_ns), 0), BUCKETS - 1)
+        count, time_s, mean, low, high = self._rows.get(at, (0, 0.0, 0.0, value, value))
+        count += 1
         # Running means: a sum of the largest floating-point numbers would overflow.
-        self._time_s[at] += (seconds(stamp_ns) - self._time_s[at]) / self._count[at]
-        self._mean[at] += value / self._count[at] - self._mean[at] / self._count[at]
-        self._low[at] = min(self._low[at], value)
-        self._high[at] = max(self._high[at], value)
+        time_s, mean = time_s + (seconds(stamp_ns) - time_s) / count, mean + (value / count - mean / count)
+        self._rows[at] = count, time_s, mean, min(low, value), max(high, value)
 
     def curve(self) -> Curve:
         """The curve of all values so far."""
-        rows = [
-            (self._time_s[at], self._mean[at], self._low[at], self._high[at])
-            for at, count in enumerate(self._count)
-            if count
-        ]
-        table = np.array(rows, np.float64).reshape(-1, 4)
+        table = np.array([row[1:] for _, row in sorted(self._rows.items())], np.float64).reshape(-1, 4)
         steps = np.diff(table[:, 0])
         if len(steps):
             gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1

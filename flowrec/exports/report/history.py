@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     CameraLosses,
@@ -17,7 +16,7 @@ from flowrec.core import (
     Drops,
     Estimate,
     Event,
-    FlowField,
+    Floats,
     Health,
     Mission,
     OperatorEvent,
@@ -28,6 +27,7 @@ from flowrec.core import (
     printable,
     seconds,
 )
+from flowrec.exports.formats import TimeProgress
 from flowrec.exports.report.curves import Curve, CurveBuilder, SpanBuilder
 from flowrec.physics import sample
 from flowrec.store import Session
@@ -67,7 +67,7 @@ class History:
     - x_um, y_um: the robot's estimated position; speed_um_s: over ground; demand_um_s: demanded of it through the fluid
     - error_um: distance to where it should be; estimate_error_um: of the estimate to the true position
     - flow_x_um_s, flow_y_um_s: flow at the robot by the observer; flow_std_um_s: one standard deviation per component
-    - map_x_um_s, map_y_um_s: the best map of that time at the robot; map_std_um_s: its standard deviation
+    - map_x_um_s, map_y_um_s: the best map of that time at the robot
     - true_x_um_s, true_y_um_s: true flow at the robot
     - nis: mean normalised innovation squared
     - tick_ms, queue_mb, dropped: time per tick, data that waits for the disk, images dropped so far
@@ -97,10 +97,10 @@ class History:
         self.alarms: dict[str, SpanBuilder] = {}
         self._builders: dict[str, CurveBuilder] = {}
         self.found = False
-        self._position: tuple[int, NDArray[np.float64]] | None = None
+        self._position: tuple[int, Floats] | None = None
 
     @classmethod
-    def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> History:
+    def of(cls, session: Session, progress: TimeProgress = lambda _: None) -> History:
         """Read a session; `progress` takes the session time in s since the first tick.
 
         Raises
@@ -128,8 +128,7 @@ class History:
 
     def curve(self, name: str) -> Curve:
         """A curve of those above; empty if nothing was recorded for it."""
-        builder = self._builders.get(name)
-        return (builder or CurveBuilder(self.first_ns, self.last_ns, 1)).curve()
+        return self._builders.get(name, CurveBuilder(self.first_ns, self.last_ns)).curve()
 
     def add(self, tick: Tick) -> None:
         """Take the next tick."""
@@ -140,8 +139,7 @@ class History:
 
     def _take(self, message: Any) -> None:
         """Take a new message of the last tick."""
-        stamp_ns: int = message.stamp_ns
-        now_s = seconds(stamp_ns)
+        now_s, put = seconds(message.stamp_ns), partial(self._put, message.stamp_ns)
         match message:
             case Event():
                 self._remark(Remark(now_s, message.text, level=message.level))
@@ -157,24 +155,23 @@ class History:
             case Estimate():
                 self._estimate(message)
             case Demand():
-                self._put(stamp_ns, demand_um_s=math.hypot(*message.velocity_um_s))
-                self._put(stamp_ns, error_um=message.error_um)
+                put(demand_um_s=math.hypot(*message.velocity_um_s))
+                put(error_um=message.error_um)
             case Health():
                 self._health(message)
             case Truth():
-                self._put(stamp_ns, true_x_um_s=message.flow_um_s[0], true_y_um_s=message.flow_um_s[1])
+                put(true_x_um_s=message.flow_um_s[0], true_y_um_s=message.flow_um_s[1])
             case Timing():
-                dropped, tick_ms = message.dropped_frames, message.total_ms
-                self._put(stamp_ns, tick_ms=tick_ms, queue_mb=message.queue_mb, dropped=dropped)
+                put(tick_ms=message.total_ms, queue_mb=message.queue_mb, dropped=message.dropped_frames)
             case Drops():
                 self.drops[message.topic] = message
             case Clocks():
                 self.clocks = message
                 if message.rate:
-                    self._put(stamp_ns, late_ms=1e3 * message.late_s, latest_ms=1e3 * message.latest_s)
+                    put(late_ms=1e3 * message.late_s, latest_ms=1e3 * message.latest_s)
             case CameraLosses():
                 self.losses = message
-                self._put(stamp_ns, lost=message.link + message.incomplete + message.driver + message.backlog)
+                put(lost=message.link + message.incomplete + message.driver + message.backlog)
 
     def _put(self, stamp_ns: int, **values: float) -> None:
         """Values that belong together: all of them, or none where one is not finite."""
@@ -195,9 +192,10 @@ class History:
         if not self.found and self.last.track is not None:
             return
         stamp_ns, position_um, tick = estimate.stamp_ns, estimate.position_um, self.last
+        put = partial(self._put, stamp_ns)
         if not np.isfinite(position_um).all():
             return
-        self._put(stamp_ns, x_um=position_um[0], y_um=position_um[1])
+        put(x_um=position_um[0], y_um=position_um[1])
         before_ns, before_um = self._position or (stamp_ns, position_um)
         moved_s = seconds(stamp_ns - before_ns)
         if moved_s >= _SPEED_OVER_S:
@@ -206,14 +204,13 @@ class History:
             self._position = (stamp_ns, position_um)
         variance = np.diagonal(estimate.covariance)[2:4]
         flow_std = math.sqrt(max(float(variance.mean()), 0.0)) if variance.size else math.nan
-        self._put(stamp_ns, flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1])
-        self._put(stamp_ns, flow_std_um_s=flow_std)
+        put(flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1])
+        put(flow_std_um_s=flow_std)
         if tick.field is not None:
             on_map = sample(tick.field, position_um)
-            self._put(stamp_ns, map_x_um_s=on_map[0], map_y_um_s=on_map[1])
-            self._put(stamp_ns, map_std_um_s=float(std_at(tick.field, position_um)))
+            put(map_x_um_s=on_map[0], map_y_um_s=on_map[1])
         if tick.truth is not None and tick.truth.stamp_ns == stamp_ns:
-            self._put(stamp_ns, estimate_error_um=math.dist(position_um, tick.truth.position_um))
+            put(estimate_error_um=math.dist(position_um, tick.truth.position_um))
 
     def _health(self, health: Health) -> None:
         self._put(health.stamp_ns, nis=health.nis)
@@ -228,19 +225,3 @@ class History:
 def _name(text: str) -> str:
     """A word of a file for a figure, whatever it holds."""
     return printable(text)[:_LONGEST_NAME]
-
-
-def std_at(field: FlowField, points_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """One standard deviation of the velocity vector of a map at points (..., 2), um/s: of the nearest pixel.
-
-    NaN where the map states none, and outside of the mask's image.
-    """
-    points = np.asarray(points_um, np.float64)
-    if field.std_um_s is None:
-        return np.full(points.shape[:-1], np.nan)
-    height, width = field.std_um_s.shape[:2]
-    column, row = np.moveaxis(np.rint(points / field.um_per_px), -1, 0)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    at = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
-    std = np.hypot(field.std_um_s[..., 0][at], field.std_um_s[..., 1][at])
-    return np.where(inside, std, np.nan)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowField
+from flowrec.core import Bools, Floats, FlowField
 from flowrec.exports.report import style
 from flowrec.exports.report.path_figure import scale_bar
 from flowrec.exports.report.report_data import ReportData
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-Floats = NDArray[np.float64]
 NOT_KNOWN = 0.25  # standard deviation over the typical speed, above which the flow counts as not known
 _MARGIN_PX = 3
 _BAR_MM = 15.0  # for a colour bar with its numbers
@@ -35,23 +33,18 @@ class Panel:
     title: str
     values: Floats
     scale: ColourScale
-    hatched: NDArray[np.bool_] | None = None
+    hatched: Bools | None = None
 
 
-def typical_speed(field: FlowField, mask: NDArray[np.bool_]) -> float:
-    """Root mean square of the speed over the fluid, um/s."""
-    found = speed(field, mask)[mask]
-    return float(np.sqrt((found**2).mean())) if found.size else 0.0
-
-
-def not_known(field: FlowField, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def not_known(field: FlowField, mask: Bools) -> Bools:
     """(h, w) fluid where one standard deviation exceeds NOT_KNOWN of the typical speed; all where none is stated."""
     if field.std_um_s is None:
         return mask
-    return mask & (uncertainty(field, mask) > NOT_KNOWN * typical_speed(field, mask))
+    typical = np.sqrt((speed(field, mask)[mask] ** 2).mean()) if mask.any() else 0.0  # root mean square, um/s
+    return mask & (uncertainty(field, mask) > NOT_KNOWN * typical)
 
 
-def known_text(field: FlowField, mask: NDArray[np.bool_], name: str) -> str:
+def known_text(field: FlowField, mask: Bools, name: str) -> str:
     """Description of the standard deviation of a map, in one or two sentences."""
     if field.std_um_s is None:
         return f"The method of the {name} map ({field.method}) states no standard deviation."
@@ -82,7 +75,7 @@ class MapFigure:
                 parts.append("Change: refined minus assumed speed.")
         else:
             parts.append("The flow was not refined in this session: there is no map after a refinement.")
-        best = refined if refined is not None else assumed
+        best = data.history.last.field
         assert best is not None
         parts.append(known_text(best, mask, "refined" if refined is not None else "assumed"))
         if data.truth is not None:
@@ -103,35 +96,35 @@ class ChangeFigure:
     title = "Flow map as recorded and as replayed"
 
     def __init__(self, before: FlowField | None, after: FlowField | None, number: int) -> None:
-        self._before, self._after = before, after
+        self._maps = {"recorded": before, "replayed": after}
         self.name = f"replay_{number}"
 
     def why_not(self, _story: ReportData) -> str:
-        if self._before is None or self._after is None:
+        before, after = self._maps.values()
+        if before is None or after is None:
             return "one of the two holds no map of the flow"
-        if self._before.same_as(self._after):
+        if before.same_as(after):
             return "the replay has the map of the recording, unchanged"
-        if self._before.velocity_um_s.shape != self._after.velocity_um_s.shape:
+        if before.velocity_um_s.shape != after.velocity_um_s.shape:
             return "the two maps have different sizes"
         return ""
 
     def caption(self, data: ReportData) -> str:
-        assert self._before is not None and self._after is not None
+        before, after = self._maps.values()
+        assert before is not None and after is not None
         return (
-            f"Recorded: the best map of the session (method {self._before.method}). Replayed: that of the replay "
-            f"(method {self._after.method}). Change: replayed minus recorded speed. "
-            + known_text(self._after, data.scene.chip.mask, "replayed")
+            f"Recorded: the best map of the session (method {before.method}). Replayed: that of the replay "
+            f"(method {after.method}). Change: replayed minus recorded speed. "
+            + known_text(after, data.scene.chip.mask, "replayed")
         )
 
     def alt(self, data: ReportData) -> str:
         return f"Maps of the flow on the chip {data.scene.chip.name}: recorded, replayed, and their difference."
 
     def draw(self, data: ReportData, width_mm: float) -> Figure:
-        assert self._before is not None and self._after is not None
         mask = data.scene.chip.mask
-        named = {"recorded": self._before, "replayed": self._after}
-        largest = max(float(np.nanmax(speed(field, mask))) for field in named.values())
-        return draw_panels(_panels_of(named, ColourScale.up_to(largest, "speed"), mask), data, width_mm)
+        largest = max(float(np.nanmax(speed(field, mask))) for field in self._maps.values() if field is not None)
+        return draw_panels(_panels_of(self._maps, ColourScale.up_to(largest, "speed"), mask), data, width_mm)
 
 
 def _panels(data: ReportData) -> list[Panel]:
@@ -140,7 +133,7 @@ def _panels(data: ReportData) -> list[Panel]:
     return [*panels, Panel("true", speed(data.truth, mask), scale)] if data.truth is not None else panels
 
 
-def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: NDArray[np.bool_]) -> list[Panel]:
+def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: Bools) -> list[Panel]:
     """The speed of one or two fields, their change, and the deviation that the last one states."""
     known = {name: field for name, field in named.items() if field is not None}
     panels = [Panel(name, speed(field, mask), scale) for name, field in known.items()]
@@ -157,11 +150,7 @@ def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: 
 def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figure:
     """Maps side by side, each kind of value with its colour bar; several rows where they do not fit in one."""
     mask, um_per_px = data.scene.chip.mask, data.scene.chip.um_per_px
-    rows_px, columns_px = np.nonzero(mask)
-    box = (
-        slice(max(rows_px.min() - _MARGIN_PX, 0), rows_px.max() + _MARGIN_PX + 1),
-        slice(max(columns_px.min() - _MARGIN_PX, 0), columns_px.max() + _MARGIN_PX + 1),
-    )
+    box = tuple(slice(max(at.min() - _MARGIN_PX, 0), at.max() + _MARGIN_PX + 1) for at in np.nonzero(mask))
     height_px, width_px = mask[box].shape
     columns = min(len(panels), 2 if width_mm > style.NARROW_MM else 1)
     rows = -(-len(panels) // columns)
@@ -179,13 +168,12 @@ def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figur
     return figure
 
 
-def _show(ax: Axes, panel: Panel, box: tuple[slice, slice]) -> AxesImage:
+def _show(ax: Axes, panel: Panel, box: tuple[slice, ...]) -> AxesImage:
     style.bare(ax)
     ax.set_facecolor(style.SOLID)
-    colours: dict[str, Any] = {"speed": style.SPEEDS, "uncertainty": style.DEVIATIONS, "change": style.CHANGES}
     shown = ax.imshow(
         panel.values[box],
-        cmap=colours[panel.scale.table],
+        cmap=style.COLOUR_MAPS[panel.scale.table],
         vmin=panel.scale.low,
         vmax=panel.scale.high,
         interpolation="nearest",

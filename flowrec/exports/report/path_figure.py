@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowrec.core import Floats
 from flowrec.exports.report import style
 from flowrec.exports.report.report_data import ReportData
-from flowrec.view import Box, arrow_grid, flow_arrows, length_text, round_below, speed
+from flowrec.view import Box, arrow_grid, flow_arrows, goal_of, length_text, round_below, speed, way_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +39,7 @@ class PathFigure:
 
     def caption(self, data: ReportData) -> str:
         parts = ["Line: the way of the robot (estimated position)."]
-        if data.route is not None:
+        if len(way_of(data.history.last.route)):
             parts.append("Dashes: the route that was planned last.")
         field = data.history.last.field
         if field is not None:
@@ -119,7 +119,7 @@ def _background(ax: Axes, data: ReportData) -> None:
         _on_mask(ax, data, np.where(scene.chip.mask, 255.0, 200.0), cmap="gray", vmin=0, vmax=255, zorder=0)
 
 
-def _on_mask(ax: Axes, data: ReportData, values: NDArray[np.float64], **how: Any) -> AxesImage:
+def _on_mask(ax: Axes, data: ReportData, values: Floats, **how: Any) -> AxesImage:
     """Values (h, w) of the mask's pixels, where the camera sees them."""
     from matplotlib.transforms import Affine2D
 
@@ -137,7 +137,7 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
     scale = data.speed_scale()
     opacity = _OVER_PICTURE if data.picture is not None else 1.0
     values = speed(field, scene.chip.mask)
-    how = {"cmap": style.SPEEDS, "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
+    how = {"cmap": style.COLOUR_MAPS["speed"], "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
     speeds = _on_mask(ax, data, values, **how)
     bar = figure.colorbar(speeds, ax=ax, shrink=0.85, aspect=22, pad=0.01, ticks=scale.ticks)
     bar.set_label("speed of the flow (µm/s)")
@@ -164,8 +164,8 @@ def _paths(ax: Axes, data: ReportData) -> None:
     """The route, the way of the robot, and where both begin and end."""
     scene = data.scene
     white: dict[str, Any] = {"color": "white", "solid_capstyle": "round"}
-    if data.route is not None:
-        route = scene.to_plane(data.route.waypoints_um)
+    route = scene.to_plane(way_of(data.history.last.route))
+    if len(route):
         ax.plot(*route.T, lw=1.8, zorder=4, **white)
         ax.plot(*route.T, color=style.INK, lw=0.9, ls=(0, (4, 2)), zorder=5)
     path = scene.to_plane(data.path_um)
@@ -174,7 +174,8 @@ def _paths(ax: Axes, data: ReportData) -> None:
     _directions(ax, path)
     known = path[np.isfinite(path[:, 0])]
     radius_px = scene.length_px(scene.robot.radius_um)
-    goal = scene.to_plane(data.goal_um) if data.goal_um is not None else None
+    goal_um = goal_of(data.history.last.mission)
+    goal = None if goal_um is None else scene.to_plane(goal_um)
     at_goal = goal is not None and float(np.hypot(*(known[-1] - goal))) < _SAME_PLACE * radius_px
     _place(ax, known[0], radius_px, "start", style.INK, below=goal is not None)
     if goal is not None:
@@ -182,7 +183,7 @@ def _paths(ax: Axes, data: ReportData) -> None:
     _place(ax, known[-1], radius_px, "" if at_goal else "end", style.VERMILLION)
 
 
-def _directions(ax: Axes, path: NDArray[np.float64]) -> None:
+def _directions(ax: Axes, path: Floats) -> None:
     """Arrow heads on the path, evenly spread over its length."""
     way = path[np.isfinite(path[:, 0])]
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
@@ -203,7 +204,7 @@ def _directions(ax: Axes, path: NDArray[np.float64]) -> None:
         ax.annotate("", end, begin, arrowprops=arrow, zorder=8)
 
 
-def _place(ax: Axes, at: NDArray[np.float64], radius: float, name: str, colour: str, *, below: bool = False) -> None:
+def _place(ax: Axes, at: Floats, radius: float, name: str, colour: str, *, below: bool = False) -> None:
     """A circle with a name, which stays within the axis."""
     from matplotlib.patches import Circle
 

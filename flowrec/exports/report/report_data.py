@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import FlowField, Image, Observations, Route, SessionError
+from flowrec.core import Floats, FlowField, Image, Observations, SessionError
+from flowrec.exports.formats import TimeProgress
 from flowrec.exports.report.history import History
 from flowrec.store import Session, nonzero_window
 from flowrec.view import ColourScale, Scene, peak
@@ -43,7 +43,7 @@ class ReportData:
     picture: CameraImage | None
 
     @classmethod
-    def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> ReportData:
+    def of(cls, session: Session, progress: TimeProgress = lambda _: None) -> ReportData:
         """Read a session; `progress` takes the session time in s since the first tick.
 
         Raises
@@ -54,10 +54,10 @@ class ReportData:
         size_px = (config.camera.width_px, config.camera.height_px)
         scene = Scene(session.chip, session.calibration, config.robot, session.path.stem, image_px=size_px)
         data = cls(session, scene, History.of(session, progress), picture_of(session))
-        shape = scene.chip.mask.shape
         for name, field in (("assumed", data.assumed), ("refined", data.refined), ("true", data.truth)):
-            if field is not None and field.velocity_um_s.shape[:2] != shape:
-                found, wanted = (" x ".join(map(str, size)) for size in (field.velocity_um_s.shape[:2], shape))
+            sizes = () if field is None else (field.velocity_um_s.shape[:2], scene.chip.mask.shape)
+            if len({*sizes}) > 1:
+                found, wanted = (" x ".join(map(str, size)) for size in sizes)
                 raise SessionError(
                     f"{session.path}: the {name} flow has {found} pixels, and the mask of the chip {wanted}; the file "
                     f"was edited or damaged, see flowrec check {session.path}"
@@ -90,18 +90,6 @@ class ReportData:
         return known if len(known.position_um) else None
 
     @property
-    def route(self) -> Route | None:
-        """The last route that was planned, if it leads anywhere."""
-        route = self.history.last.route
-        return route if route is not None and route.reachable and len(route.waypoints_um) > 1 else None
-
-    @property
-    def goal_um(self) -> NDArray[np.float64] | None:
-        """Goal (2,) of the mission, in um; None: none was set."""
-        mission = self.history.last.mission
-        return mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
-
-    @property
     def no_map(self) -> str:
         """Reason why there is no map of the flow; '' if there is one."""
         return "the session holds no map of the flow" if self.assumed is None and self.refined is None else ""
@@ -115,7 +103,7 @@ class ReportData:
         return "the robot was never seen" if unseen else "the session holds no estimate of the robot's position"
 
     @property
-    def path_um(self) -> NDArray[np.float64]:
+    def path_um(self) -> Floats:
         """(n, 2) the way of the robot; a row of NaN interrupts it."""
         curves = self.history.curve("x_um"), self.history.curve("y_um")
         return np.column_stack([curve.mean for curve in curves])
@@ -131,23 +119,20 @@ def picture_of(session: Session) -> CameraImage | None:
     if not session.reader.counts.get("frame"):
         return None
     first_ns, last_ns = session.run.first_ns, session.run.last_ns
-    frames = {}
+    images: dict[int, Image] = {}
     for stamp_ns in np.linspace(first_ns, last_ns, _IMAGES).astype(np.int64).tolist():
         frame = session.reader.tick_before(stamp_ns).frame
         if frame is not None and frame.image.size:
-            frames[frame.index] = frame
-    if not frames:
+            images[frame.index] = frame.image
+    if not images:
         return None
-    images = [frame.image for frame in frames.values()]
-    whole = [image for image in images if image.shape == images[0].shape and _is_whole(image)]
-    chosen = np.stack(whole or images[:1])
+    first, *_ = images.values()
+    height, width = first.shape
+    alike = [image for image in images.values() if image.shape == first.shape]
+    whole = [image for image in alike if nonzero_window(image) == (0, 0, width, height)]
+    chosen = np.stack(whole or [first])
     step = -(-chosen.shape[2] // _LARGEST_PX)
     grey = np.median(chosen[:, ::step, ::step], axis=0)
     low, high = np.percentile(grey, (_DARKEST, _BRIGHTEST))
     levels = np.clip((grey - low) / max(high - low, 1.0) * 255.0, 0.0, 255.0)
     return CameraImage(levels.astype(np.uint8), step, len(chosen))
-
-
-def _is_whole(image: Image) -> bool:
-    height, width = image.shape
-    return nonzero_window(image) == (0, 0, width, height)

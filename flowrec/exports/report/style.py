@@ -21,32 +21,26 @@ WIDTHS_MM = (NARROW_MM, WIDE_MM)
 INK, QUIET, FAINT, SOLID = "#222222", "#767676", "#dddddd", "#c8c8c8"
 # Distinguishable with colour blindness (Okabe and Ito 2008).
 ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7"
-SPEEDS, DEVIATIONS, CHANGES = "YlGnBu", "Purples", "PuOr"
-FONT_PT = 7.0
+COLOUR_MAPS = {"speed": "YlGnBu", "uncertainty": "Purples", "change": "PuOr"}  # by ColourScale.table
 PAGE_DPI, PAPER_DPI = 140, 300  # of images inside of a figure
 _RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with matplotlib
-    "font.size": FONT_PT,
-    "axes.titlesize": FONT_PT,
+    "font.size": 7.0,  # of all texts: the sizes of labels and legends are relative to it
+    "axes.titlesize": "medium",
     "axes.titlelocation": "left",
     "axes.titlepad": 3.0,
-    "axes.labelsize": FONT_PT,
     "axes.linewidth": 0.6,
     "axes.edgecolor": QUIET,
     "axes.labelcolor": INK,
     "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.grid": False,
-    "xtick.labelsize": FONT_PT,
-    "ytick.labelsize": FONT_PT,
     "xtick.color": INK,
     "ytick.color": INK,
     "xtick.major.size": 2.5,
     "ytick.major.size": 2.5,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    "legend.fontsize": FONT_PT,
     "legend.frameon": False,
     "legend.borderaxespad": 0.2,
     "legend.handlelength": 1.6,
@@ -55,7 +49,6 @@ _RC: dict[str, Any] = {
     "text.color": INK,
     "text.parse_math": False,  # a name may hold dollar signs
     "pdf.fonttype": 42,  # TrueType: text can be searched and edited
-    "pdf.compression": 6,
     "svg.hashsalt": "flowrec",
     "path.simplify_threshold": 0.2,
     "figure.constrained_layout.h_pad": 0.03,
@@ -80,13 +73,13 @@ def drawing() -> Iterator[None]:
         yield
 
 
-def new_figure(width_mm: float, height_mm: float) -> Figure:
+def new_figure(width_mm: float, height_mm: float, dpi: int = PAGE_DPI) -> Figure:
     """An empty figure without a window and without pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     size = (width_mm / MM_PER_INCH, height_mm / MM_PER_INCH)
-    figure = Figure(figsize=size, layout="constrained", dpi=PAGE_DPI)
+    figure = Figure(figsize=size, layout="constrained", dpi=dpi)
     FigureCanvasAgg(figure)
     return figure
 
@@ -103,11 +96,8 @@ def legend_above(ax: Axes, columns: int = 4) -> None:
     figure = ax.get_figure()
     assert figure is not None
     narrow = figure.bbox.width / PAGE_DPI * MM_PER_INCH <= NARROW_MM + 0.5
-    handles, labels = ax.get_legend_handles_labels()
-    if handles:
+    if ax.get_legend_handles_labels()[0]:
         ax.legend(
-            handles,
-            labels,
             loc="lower left",
             bbox_to_anchor=(0.0, 1.0),
             ncols=min(columns, 2) if narrow else columns,

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Observations, Phase
+from flowrec.core import Floats, Observations, Phase
 from flowrec.exports.report import style
 from flowrec.exports.report.curves import Curve
 from flowrec.exports.report.history import History
@@ -46,9 +45,8 @@ def panels(history: History, width_mm: float, heights_mm: list[float]) -> tuple[
             ax.axvline(at_s, color=style.FAINT, lw=0.6, zorder=0)
     axes[-1].set_xlabel("session time (s)")
     axes[-1].set_xlim(history.first_s, history.last_s)
-    for ax in axes[:-1]:
-        ax.tick_params(labelbottom=False)
-    axes[-1].tick_params(labelbottom=True)
+    for ax in axes:
+        ax.tick_params(labelbottom=ax is axes[-1])
     figure.align_ylabels(axes)
     return figure, list(axes)
 
@@ -97,7 +95,7 @@ def shown_observations(data: ReportData) -> tuple[Observations | None, str]:
 
 
 def observation_points(
-    ax: Axes, observations: Observations, observed: NDArray[np.float64], ms: float, zorder: float | None = None
+    ax: Axes, observations: Observations, observed: Floats, ms: float, zorder: float | None = None
 ) -> None:
     """Observations of `shown_observations` as points with one standard deviation."""
     assert observations.time_s is not None, "those without times are not shown"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from flowrec.core import Action, Alarm, Level
@@ -34,7 +34,7 @@ class Lane:
     name: str
     colour: str
     spans: Sequence[Span] = ()
-    moments: Sequence[tuple[float, str]] = field(default=())
+    moments: Sequence[tuple[float, str]] = ()
 
 
 class TimelineFigure:
@@ -95,20 +95,14 @@ class TimelineFigure:
         return figure
 
     def _lanes(self, history: History) -> list[Lane]:
+        warnings = [(each.time_s, "") for each in history.remarks if each.level in (Level.WARNING, Level.ERROR)]
+        actions = [(each.time_s, number) for number, each in numbered_actions(history.remarks)]
         lanes = [
             Lane("robot not in view", style.VERMILLION, history.unseen.spans),
             Lane("held by the operator", style.BLUE, history.held.spans),
-            *(
-                Lane(ALARMS.get(name, name), style.ORANGE, found.spans)
-                for name, found in sorted(history.alarms.items())
-            ),
-            Lane("warnings", style.ORANGE, (), [(each.time_s, "") for each in history.remarks if _warns(each)]),
-            Lane(
-                "operator",
-                style.BLUE,
-                (),
-                [(each.time_s, number) for number, each in numbered_actions(history.remarks)],
-            ),
+            *(Lane(ALARMS.get(name, name), style.ORANGE, each.spans) for name, each in sorted(history.alarms.items())),
+            Lane("warnings", style.ORANGE, moments=warnings),
+            Lane("operator", style.BLUE, moments=actions),
             Lane("no image", style.INK, self._gaps),
         ]
         return [lane for lane in lanes if lane.spans or lane.moments]
@@ -129,7 +123,3 @@ def _labels(moments: Sequence[tuple[float, str]], apart_s: float) -> list[tuple[
         else:
             groups.append([moment])
     return [(group[-1][0], group[0][1] if len(group) == 1 else f"{group[0][1]}-{group[-1][1]}") for group in groups]
-
-
-def _warns(remark: Remark) -> bool:
-    return remark.level in (Level.WARNING, Level.ERROR)
