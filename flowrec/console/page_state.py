@@ -17,7 +17,10 @@ from flowrec.core import Floats, Phase, Tick, printable, seconds, shift_px
 from flowrec.view import Batch, Scene, encode_jpeg, goal_of, state_text, way_of
 
 # What the page shows depends on these fields of a tick.
-SHOWN = ("frame", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing", "losses")
+SHOWN = (
+    *("frame", "shift", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing"),
+    "losses",
+)
 _QUALITY = 80  # of the JPEG
 _EDGE_PX = 3  # by which the mask goes on beyond its border, so that its openings are not drawn as walls
 _SMOOTHING_PX = 0.7  # of the walls, in pixels of the mask

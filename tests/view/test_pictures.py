@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from flowrec.console.page_state import PageState
+from flowrec.console.page_state import SHOWN, PageState
 from flowrec.core.enums import Outcome
 from flowrec.core.messages import FlowField, Shift
 from flowrec.core.topics import Tick
@@ -251,7 +251,7 @@ def test_a_shaken_image_is_moved_back_to_where_route_and_robot_lie_in_every_view
     moved = np.array(record.logged["/camera/measured"].translation.as_arrow_array().to_pylist()[0])[:2]
     assert np.allclose(at + off_px + moved, at, atol=1e-3)  # where the image shows it
     page = PageState(turned)
-    page.take(Batch(1, [{"estimate": tick.estimate, "shift": tick.shift}], {}))
+    page.take(Batch(1, [tick.news(Tick(), SHOWN)], {}))  # what the feed hands on
     assert np.allclose(page.state()["robot"], at + off_px, atol=0.06)
     assert np.allclose(page.chip_um(*(at + off_px)), tick.estimate.position_um, atol=0.01)
     viewer = ViewerScene(ChipCamera(turned.calibration, (640, 512), 50.0))
