@@ -18,8 +18,8 @@ from flowrec.view import Batch, Scene, encode_jpeg, goal_of, state_text, way_of
 
 # What the page shows depends on these fields of a tick.
 SHOWN = (
-    *("frame", "shift", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing"),
-    "losses",
+    *("frame", "shift", "refined", "route", "estimate", "mission", "demand"),
+    *("currents", "event", "timing", "losses"),
 )
 _QUALITY = 80  # of the JPEG
 _EDGE_PX = 3  # by which the mask goes on beyond its border, so that its openings are not drawn as walls
