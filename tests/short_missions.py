@@ -10,8 +10,9 @@ SMALL = [
     "survey.method=downstream",
     "refine.assimilate.doubt_depth=false",
     "recording.admission_s=0",  # what the machine holds beside all other tests is of no interest
+    "recording.own_process=false",  # which loads its own libraries, for longer than the mission takes
     "mission.check_axes=false",
 ]
 
 # In real time, and still under way however long a busy machine takes for what a test does meanwhile.
-LONG = [*SMALL, "mission.hold_start_s=100", "safety.guard_timeout_s=20"]
+LONG = [*SMALL, "recording.own_process=true", "mission.hold_start_s=100", "safety.guard_timeout_s=20"]

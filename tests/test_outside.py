@@ -138,6 +138,7 @@ def test_a_session_by_the_planner_of_a_package_is_verified_exported_and_read_by_
         assert session.setting("plan", "lab_kit_steps", "neighbours") == 8
 
 
+@pytest.mark.slow("five verbs in processes that find the package")
 def test_a_topic_of_a_package_is_recorded_and_read_compared_exported_and_replayed_without_it(
     flown: Path, tmp_path: Path
 ) -> None:
@@ -172,6 +173,7 @@ def test_a_topic_of_a_package_is_recorded_and_read_compared_exported_and_replaye
     assert "/lab_kit/pressure, in its messages" in damaged.out and "pressure_pa" in different.out
 
 
+@pytest.mark.slow("three verbs in a process that finds the package")
 def test_settings_of_a_package_are_checked_like_ours_and_shown_by_a_dry_run(site: Path) -> None:
     unknown, beyond, dry, helped = flowrec(
         site,
@@ -222,7 +224,7 @@ def test_without_the_package_its_session_is_read_and_a_replay_says_what_to_insta
 @pytest.mark.parametrize(
     ("version", "code", "status", "said"),
     [
-        ("1.1", ("", ""), 0, "recorded with lab_kit 1.0, replayed with lab_kit 1.1"),
+        pytest.param("1.1", ("", ""), 0, "recorded with lab_kit 1.0, replayed with lab_kit 1.1", marks=ONCE_MORE),
         pytest.param(
             *("1.0", ("-> bool", "->  bool"), 0, "recorded with other code of lab_kit 1.0: sha256 "), marks=ONCE_MORE
         ),
@@ -256,6 +258,7 @@ def test_a_sweep_does_a_replay_again_whose_package_has_other_code(site: Path, fl
     assert "1 replays to do, 1 are done" in third.err
 
 
+@pytest.mark.slow("three verbs in processes of their own")
 def test_a_broken_package_stops_nothing_that_does_not_use_it(site: Path, flown: Path, tmp_path: Path) -> None:
     broken = changed(site, tmp_path, code=("import json", "raise RuntimeError('no licence')"))
     listed, helped, used, read, ours = flowrec(

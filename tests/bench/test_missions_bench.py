@@ -149,6 +149,7 @@ def test_a_flow_too_swift_is_refused_before_the_robot_is_let_in():
     assert not ticks
 
 
+@pytest.mark.slow("flies two missions of the bench")
 def test_a_summary_counts_and_pairs_what_arrived(flown, tmp_path, capsys):
     row, _ = flown
     rows = [

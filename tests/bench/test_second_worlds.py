@@ -57,6 +57,7 @@ def test_a_fault_of_robot_or_pump_changes_what_is_measured_and_not_the_mask(worl
     assert max(np.abs(same).max(), np.abs(place).max()) > 2.0
 
 
+@pytest.mark.slow("surveys three worlds")
 def test_the_same_seed_gives_the_same_survey_and_two_faults_are_two() -> None:
     one, two = make_survey("two_faults", 2), make_survey("two_faults", 2)
     assert np.array_equal(one.observations.flow_um_s, two.observations.flow_um_s)
@@ -84,7 +85,12 @@ def test_a_survey_is_refined_and_scored_like_a_flight() -> None:
 
 
 @pytest.mark.parametrize(
-    ("world", "seed", "doubted"), [("growing_bubble", 3, 1), ("late_clock", 2, 1), ("roller", 2, 0)]
+    ("world", "seed", "doubted"),
+    [
+        pytest.param("growing_bubble", 3, 1, marks=pytest.mark.slow("refines a survey of a network")),
+        ("late_clock", 2, 1),
+        ("roller", 2, 0),
+    ],
 )
 def test_what_no_cause_explains_is_said_alone_and_a_pump_that_pulsates_explains_it(world, seed, doubted) -> None:
     flight = fly(FlightCase(world, "second", seed))
@@ -96,6 +102,7 @@ def test_what_no_cause_explains_is_said_alone_and_a_pump_that_pulsates_explains_
     assert any(words in found["note"] for words in taken_for) != bool(doubted)
 
 
+@pytest.mark.slow("solves a flow on a finer grid")
 def test_the_truth_does_not_depend_on_the_subcells_of_its_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     coarse_truth = make_survey("as_stated", 4).truth_um_s
     monkeypatch.setattr(second, "FlowSolver", lambda _: FlowSolver(2))

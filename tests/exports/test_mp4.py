@@ -103,6 +103,7 @@ def test_the_file_is_what_players_open_and_states_scale_time_and_session(session
     assert metadata["creation_time"][:19] == session.provenance["wall_time"][:19]
 
 
+@pytest.mark.slow("draws a movie")
 def test_the_robot_is_in_its_ring_and_nothing_is_drawn_over_it(session, tmp_path):
     frames, _, _ = read(written(mp4.Mp4Export(), session, tmp_path / "x.mp4"))
     ticks = list(with_images(session))

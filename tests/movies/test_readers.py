@@ -263,6 +263,7 @@ def test_a_folder_is_read_in_natural_order_also_with_odd_names(tmp_path):
         open_movie(tmp_path / "empty")
 
 
+@pytest.mark.slow("reads hostile files in processes with limits")
 def test_what_a_header_declares_is_not_believed(tmp_path):
     """A billion images cost no memory, and data that is missing is not taken for black images."""
     images = pictures()
@@ -361,6 +362,7 @@ def test_what_can_not_be_kept_exactly_is_refused(tmp_path):
     assert facts.bits == 16 and "16 are assumed" in remarks[0]
 
 
+@pytest.mark.slow("packs and unpacks eight gigabytes of zeros")
 def test_a_zarr_whose_chunks_hold_nothing_or_unpack_without_measure_is_refused(tmp_path):
     none = makers.ome_zarr(tmp_path / "none.zarr", pictures(), 0.05) / "0" / "zarr.json"
     head = json.loads(none.read_text())

@@ -66,6 +66,7 @@ def test_the_picture_is_thinned_by_the_least_step_that_makes_it_900_pixels_wide(
     assert picture.image.shape[1] == -(-width // step) <= 900
 
 
+@pytest.mark.slow("records a mission with a known motion")
 def test_the_curves_of_motion_are_what_their_labels_say(data: ReportData) -> None:
     figure = MotionFigure().draw(data, WIDE_MM)
     found = lines_of(figure)

@@ -236,6 +236,7 @@ def test_the_true_world_differs_from_the_assumed_one_within_its_bounds():
     assert same.viscosity_mpa_s == chip.viscosity_mpa_s
 
 
+@pytest.mark.slow("thousands of images")
 def test_the_robot_jitters_as_much_as_it_is_told_to():
     simulated = replace(EXACT, position_noise_um=3.0)
     ends = [

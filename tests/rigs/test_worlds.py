@@ -198,6 +198,7 @@ def test_the_mask_of_a_large_chip_keeps_its_pixel_size_and_every_one_of_its_chan
     assert at_centres(true.mask.astype(float), large).shape == mask.shape
 
 
+@pytest.mark.slow("solves the flow of worlds")
 def test_a_blocked_branch_keeps_the_rest_of_its_width_and_keeps_away_from_the_start():
     start = np.array([[3100.0, 3400.0]])  # in the short branch
     places = []
@@ -215,6 +216,7 @@ def test_a_blocked_branch_keeps_the_rest_of_its_width_and_keeps_away_from_the_st
     assert len(set(places)) > 3
 
 
+@pytest.mark.slow("solves a flow on a finer grid")
 def test_the_flow_between_true_walls_is_what_the_finer_field_says_at_the_chips_pixels():
     rig = rig_of("simulated.world=moderate", "simulated.wall_error_px=1", "simulated.seed=2")
     world = rig.true_world()

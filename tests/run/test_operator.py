@@ -251,6 +251,7 @@ def test_what_a_killed_run_left_is_recovered_at_the_next_start_and_its_name_is_t
     assert junk.exists()
 
 
+@pytest.mark.slow("three processes")
 @pytest.mark.usefixtures("patient")
 def test_remains_are_looked_after_in_any_thread(session: Path, tmp_path: Path) -> None:
     (tmp_path / "left.mcap.partial").write_bytes(session.read_bytes()[: session.stat().st_size // 2])

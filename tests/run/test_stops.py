@@ -141,6 +141,7 @@ def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run
     assert any(action == "zero" and "SIGTERM again" in text for action, text in actions), actions
 
 
+@pytest.mark.slow("the real command, stopped and continued")
 def test_ctrl_z_stops_the_process_with_the_field_off_and_fg_ends_the_run(tmp_path: Path) -> None:
     done = ended("SIGTSTP", tmp_path, PATIENT)
     stopped = (tmp_path / "driver.log.stopped").read_text().split("\n")
@@ -196,6 +197,7 @@ def test_a_camera_that_hangs_in_c_loses_the_field_and_the_process_ends_by_itself
     assert replay_session(done.path, Change(), verify=True).comparison.identical
 
 
+@pytest.mark.slow("the real command, ended by a stage")
 def test_a_stage_that_raises_ends_the_run_after_the_field(tmp_path: Path) -> None:
     done = ended("stage raises", tmp_path, PATIENT)
     assert [event for event, _ in done.after_cause()[:3]] == ["cause", "zero-begins", "zero"]

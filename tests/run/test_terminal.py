@@ -154,6 +154,7 @@ def test_a_frozen_terminal_neither_stops_the_run_nor_its_end(command: Command) -
     assert termios.tcgetattr(command.keys) == command.before
 
 
+@pytest.mark.slow("the real command on a terminal of its own")
 def test_when_the_terminal_is_closed_the_run_ends_in_good_order(command: Command) -> None:
     command.frozen = True
     command.until(lambda: not command.reads)  # or the thread would read of a descriptor that is closed

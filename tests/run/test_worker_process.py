@@ -117,6 +117,7 @@ def answer(process: ProcessWorker) -> Any:
     return results.get("assumed")
 
 
+@pytest.mark.slow("starts three workers")
 def test_orders_are_answered_as_at_home_and_a_process_that_is_killed_is_told_of(pipeline, order, working) -> None:
     process = working()
     process.submit(order)

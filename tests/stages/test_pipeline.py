@@ -28,6 +28,7 @@ def after(pipeline, last, ticks):
     return last
 
 
+@pytest.mark.slow("flies two missions")
 def test_mission_and_controller_place_the_robot_by_the_registration_that_was_found_and_observations_keep_the_stated(
     navigation,
 ):

@@ -71,7 +71,7 @@ def messages(draw, kind):
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
 def test_every_message_comes_back_bit_for_bit(kind):
-    @settings(max_examples=40)
+    @settings(max_examples=15)
     @given(messages(kind))
     def round_trip(message):
         _, sequence, parts = codec.encode_record(message, message_codec(kind))
@@ -92,7 +92,7 @@ def test_every_message_comes_back_bit_for_bit(kind):
     "kind", [Maybe, *(kind for kind in TYPES if kind is not Frame)], ids=lambda kind: kind.__name__
 )
 def test_bytes_are_those_that_protobuf_itself_would_write(kind):
-    @settings(max_examples=40)
+    @settings(max_examples=15)
     @given(messages(kind))
     def same(message):
         payload = encode(message)

@@ -70,6 +70,7 @@ def test_ticks_are_seen_while_the_run_goes_on_and_in_the_end_all_of_them_as_they
     assert watcher.failure is None and same(watcher.ticks, SessionReader(path).ticks()) and len(watcher.ticks) == 90
 
 
+@pytest.mark.slow("records a run in a process of its own")
 def test_no_tick_is_seen_before_its_image_has_come(tmp_path):
     path = tmp_path / "x.mcap"
     writer, watcher = begun(path)
@@ -108,6 +109,7 @@ def test_a_recorder_that_is_killed_ends_the_view_with_what_to_do(tmp_path):
     assert seen == [tick.stamp_ns for tick in SessionReader(recover(writer.partial_path).path).ticks()][: len(seen)]
 
 
+@pytest.mark.slow("records two runs in processes of their own")
 def test_runs_are_listed_while_they_are_recorded_and_only_those_can_be_watched(tmp_path):
     path = tmp_path / "x y.mcap"
     with SessionWriter(path, HEADER, OPTIONS) as writer, SessionWriter(tmp_path / ".trial.mcap", HEADER, OPTIONS):

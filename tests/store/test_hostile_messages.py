@@ -217,6 +217,7 @@ def test_a_text_that_would_become_gigabytes_of_tables_is_not_parsed(tmp_path, to
     assert isinstance(done.exception, UsageError) and said in str(done.exception)
 
 
+@pytest.mark.slow("makes a message of 176 MB")
 def test_a_state_of_more_than_176_mb_is_refused_whichever_way_it_is_read(tmp_path):
     # Three flow fields of 66 MB: each fits into a chunk, and all of them are known at the last tick.
     shape = (1800, 1850)

@@ -67,6 +67,7 @@ def test_other_compressions_are_not_even_tried(tmp_path, compression):
     refused(file_of(tmp_path, piece), "is not known to flowrec")
 
 
+@pytest.mark.slow("makes a file of a million messages")
 def test_a_million_empty_messages_are_not_made(tmp_path):
     tiny = record(MESSAGE, struct.pack("<HIQQ", STATE, 0, 10**9, 10**9)) * 140_000
     packed = zstandard.compress(tiny)

@@ -51,7 +51,7 @@ def recorder_of(writer: SessionWriter) -> int:
     return writer._recorder._child.process.pid
 
 
-@pytest.mark.parametrize("block", [True, False])
+@pytest.mark.parametrize("block", [True, pytest.param(False, marks=pytest.mark.slow("the same without waiting"))])
 def test_a_process_writes_the_messages_that_a_thread_writes(tmp_path, block):
     for name, own in (("process", True), ("thread", False)):
         record(tmp_path / f"{name}.mcap", replace(OWN, own_process=own, block=block))
@@ -79,7 +79,7 @@ def test_a_part_begins_with_the_last_image_before_it_whatever_its_memory_is_used
     monkeypatch.setattr(shared_queue, "_MARGIN_BYTES", 1000)
     options = replace(OWN, block=block, files=Split(seconds=0.2), queue_limit_bytes=1 << 20)
     with SessionWriter(tmp_path / "p.mcap", HEADER, options) as writer:
-        for tick in ticks_of(600):  # faster than they are written: the memory is always full
+        for tick in ticks_of(200):  # faster than they are written: the memory is always full
             writer.write(tick)
     last, repeated = None, 0
     for part in writer.files:
@@ -265,6 +265,7 @@ def test_a_run_that_waits_for_its_recorder_ends_when_that_is_killed(tmp_path):
         writer.close()
 
 
+@pytest.mark.slow("waits for a recorder that writes nothing")
 def test_a_recorder_that_writes_nothing_for_long_is_told_and_completes_the_file_when_it_can(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_process, "_SILENT_S", 0.5)
     writer = SessionWriter(tmp_path / "x.mcap", HEADER, OWN)
@@ -290,12 +291,14 @@ def test_a_recorder_ends_with_its_run_and_by_no_signal_that_asks_it_to(tmp_path,
         assert file.counts["frame"] == len(TICKS)
 
 
+@pytest.mark.slow("waits for two recorders")
 def test_the_recorder_gives_way_to_a_run_that_waits_for_it_and_to_no_live_one(tmp_path):
     for block in (True, False):
         with SessionWriter(tmp_path / f"{block}.mcap", HEADER, replace(OWN, block=block)) as writer:
             assert (os.getpriority(os.PRIO_PROCESS, recorder_of(writer)) > 0) == block
 
 
+@pytest.mark.slow("a small file system")
 def test_a_disk_that_is_full_ends_the_run_with_its_reason_and_what_was_written_is_recovered(tmp_path):
     path = tmp_path / "x.mcap"
     writer = SessionWriter(path, HEADER, WriterOptions(own_process=True, flush_s=0.05))

@@ -91,6 +91,7 @@ def run(tmp_path):
     return tmp_path / "x.mcap"
 
 
+@pytest.mark.slow("reads a session from many times, cut in many ways")
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cuts=st.sets(st.integers(1, len(TICKS) - 1), max_size=6), late=st.integers(-1, len(TICKS)), data=st.data())
 def test_however_a_session_is_cut_its_ticks_are_the_same_from_any_time(whole, tmp_path_factory, cuts, late, data):

@@ -85,7 +85,7 @@ def whole(tmp_path_factory):
     return path
 
 
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     split=st.builds(
         Split, st.one_of(st.none(), st.floats(0.02, 1.5)), st.one_of(st.none(), st.floats(0.5 * PERIOD_NS / 1e9, 2.5))

@@ -76,6 +76,7 @@ def test_um_per_revolution_that_the_motion_refutes_are_replaced_and_both_are_rec
     assert (found["um_per_rev_stated"], found["um_per_rev_used"]) == (30.0, session.config.robot.um_per_rev)
 
 
+@pytest.mark.slow("aligns a whole movie by its motion")
 def test_calibrate_motion_finds_an_imported_session_aligned(imported: Path) -> None:
     motion = calibrate_motion(imported)
     seen = sum(track.seen for track in flowrec.open(imported).messages("track"))

@@ -84,6 +84,7 @@ def test_the_mask_of_a_large_picture_has_larger_pixels_and_says_so(image, tmp_pa
     assert chip.size_um == pytest.approx(UM_PER_PX * np.array(SIZE_PX), rel=1e-3)
 
 
+@pytest.mark.slow("solves the flow on two chips")
 def test_a_known_width_moves_the_walls(image):
     plain = calibrate_chip(image, None, UM_PER_PX, walls="dark")
     narrower = calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-UM_PER_PX)

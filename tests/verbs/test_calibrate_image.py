@@ -65,6 +65,7 @@ def test_a_mission_with_the_registration_refines_as_with_the_exact_pose(registra
     assert np.sqrt(np.mean(np.square(off))) < 6.0
 
 
+@pytest.mark.slow("flies a mission for its image")
 def test_a_registration_goes_before_the_section_and_after_what_is_typed(registration, tmp_path):
     path = tmp_path / "own.toml"
     path.write_text(f"[camera]\num_per_px = 33.0\nregistration = {json.dumps(str(registration))}\n")

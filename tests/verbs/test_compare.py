@@ -168,6 +168,7 @@ def test_images_that_a_replay_did_not_copy_are_told_with_what_leaves_them_out(
     assert "without parent, /camera/frame, drawings" in said.splitlines()[-1]
 
 
+@pytest.mark.slow("compares two missions whole")
 def test_what_is_in_one_session_only_is_one_line_a_topic(tmp_path: Path, ticks: list[Tick]) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     second = small_session(tmp_path / "b.mcap", ticks, sets=("recording.leave_out=['/truth/*']",))

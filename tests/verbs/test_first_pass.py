@@ -36,7 +36,8 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Config:
     (folder / "chip.png").write_bytes(png)
     (folder / "chip.toml").write_text(toml, encoding="utf-8")
     sets = [f"camera.um_per_px={UM_PER_PX}", f"chip.path={folder / 'chip.toml'}", f"robot.radius_um={ROBOT.radius_um}"]
-    return load_config(None, [*sets, "movie.rate_hz=30", "refine.assimilate.doubt_depth=false"])
+    sets += ["movie.rate_hz=30", "refine.assimilate.doubt_depth=false", "recording.own_process=false"]
+    return load_config(None, sets)
 
 
 def movie(folder: Path, places: list[list[tuple[float, float]]], shake_px: float = 0.0) -> Path:
@@ -116,6 +117,7 @@ def test_a_shaking_movie_gives_the_track_of_a_still_one_and_replays_exactly(know
     assert not any(shift.shift_px.any() for shift in flowrec.open(tmp_path / "still.mcap").messages("shift"))
 
 
+@pytest.mark.slow("imports and replays a movie")
 def test_a_doubtful_track_makes_the_session_doubtful_wherever_it_is_shown(
     known: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

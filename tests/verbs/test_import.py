@@ -71,7 +71,7 @@ def lab(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
         rows.append((f"{tick.stamp_ns / 1e9:.4f}", c.frequency_hz, np.degrees(c.heading_rad), c.amplitude_mt))
     known = [f"robot.{key}={getattr(truth.config.robot, key)}" for key in ("radius_um", "um_per_rev", "delay_s")]
     known += [f"camera.um_per_px={truth.config.camera.um_per_px}", f"chip.path={folder / 'chip.toml'}"]
-    known += ["refine.assimilate.doubt_depth=false"]  # as the run
+    known += ["refine.assimilate.doubt_depth=false", "recording.own_process=false"]  # as the run
     images, stamps = [tick.frame.image for tick in ticks], [tick.stamp_ns for tick in ticks]
     made = Laboratory(folder, load_config(None, known), folder, images, stamps, truth)
     made.log = made.table("log.csv", rows)
@@ -143,6 +143,7 @@ def test_a_session_that_was_imported_replays_with_other_settings(lab: Laboratory
     assert lab.error(out) > 2.0 * lab.error(imported)  # a robot that rolls 20 um per revolution was another one
 
 
+@pytest.mark.slow("imports a movie and refines by it")
 def test_without_a_log_the_movie_is_still_a_session_that_says_what_it_does_not_know(
     lab: Laboratory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -317,6 +318,7 @@ def test_a_session_never_replaces_what_it_is_made_of(lab: Laboratory, tmp_path: 
     assert movie.exists()
 
 
+@pytest.mark.slow("imports a movie twice")
 def test_walls_that_are_not_where_the_registration_says_are_told_before_the_import_and_in_the_file(
     lab: Laboratory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -332,7 +334,7 @@ def test_walls_that_are_not_where_the_registration_says_are_told_before_the_impo
     ("share", "way"),
     [
         (-0.05, "small"),
-        (0.0, ""),
+        pytest.param(0.0, "", marks=pytest.mark.slow("imports a movie of the right scale")),
         pytest.param(0.05, "large", marks=pytest.mark.slow("imports a movie, to the other side")),
     ],
 )
@@ -352,6 +354,7 @@ def test_a_scale_that_the_walls_contradict_makes_the_import_doubtful_with_the_se
         assert any(told[0] in finding.text for finding in flowrec.check(tmp_path / "a.mcap").findings)
 
 
+@pytest.mark.slow("imports a turned movie")
 def test_a_movie_that_shows_the_chip_turned_is_refused_with_the_setting_to_paste(
     lab: Laboratory, tmp_path: Path
 ) -> None:
@@ -382,6 +385,7 @@ def test_one_image_makes_a_session(lab: Laboratory, tmp_path: Path) -> None:
     assert flowrec.replay(tmp_path / "one.mcap", verify=True).same
 
 
+@pytest.mark.slow("imports a movie with gaps")
 def test_gaps_in_the_cameras_numbers_are_counted_as_losses(lab: Laboratory, tmp_path: Path) -> None:
     makers.folder(tmp_path / "few", [lab.images[n] for n in (0, 1, 4, 5)])
     big = 10**9
@@ -410,6 +414,7 @@ def test_a_rig_that_plays_a_movie_is_paced_by_its_stamps(lab: Laboratory, tmp_pa
     np.testing.assert_allclose(sum(slept), stamps[-1] / 1e9, rtol=1e-9)
 
 
+@pytest.mark.slow("imports a movie and fails halfway")
 def test_a_failure_while_the_file_grows_leaves_nothing(lab: Laboratory, tmp_path: Path, monkeypatch) -> None:
     """Whatever stage fails: the partial file has the name of no session, and goes."""
     from flowrec.stages.estimation import Sampler

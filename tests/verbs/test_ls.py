@@ -71,6 +71,7 @@ def test_a_run_that_is_going_on_is_listed_as_such(tmp_path: Path) -> None:
     assert [row.outcome for row in ls([tmp_path])] == ["ended"]
 
 
+@pytest.mark.slow("two runs in real time")
 @pytest.mark.skipif(sys.platform == "win32", reason="descriptors are inherited by POSIX processes only")
 def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"

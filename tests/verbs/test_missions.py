@@ -105,6 +105,7 @@ def test_a_robot_slower_than_the_flow_says_that_it_can_not_go_back(tmp_path: Pat
     assert recorded.exit_status == 1
 
 
+@pytest.mark.slow("flies a mission")
 def test_a_robot_that_is_not_in_view_is_not_found_and_nothing_is_driven(tmp_path: Path) -> None:
     recorded = record(load_config(None, [*SMALL, "camera.um_per_px=2"]), tmp_path / "blind.mcap")
     assert recorded.report.outcome == "not found"

@@ -21,7 +21,7 @@ from flowrec.verbs.record import record
 from flowrec.verbs.session_replay import replay_session
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.toml"
-OBSERVE = ("mission.phases=observe", "duration_s=3.0")
+OBSERVE = ("mission.phases=observe", "duration_s=3.0", "recording.own_process=false")
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,7 @@ def test_a_replay_of_an_observation_is_exact_and_its_file_is_whole(observed: Pat
     assert not check(observed).findings
 
 
+@pytest.mark.slow("flies an observation")
 def test_a_robot_out_of_sight_ends_no_observation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = pipeline._find_robot
 

@@ -51,6 +51,7 @@ def test_the_mission_reaches_its_goal_without_touching_a_wall(mission: Recorded)
     assert mission.facts["frames_dropped"] == 0
 
 
+@pytest.mark.slow("flies a mission once more")
 def test_the_same_seed_gives_the_same_messages(session: Path, tmp_path: Path) -> None:
     again = record(load_config(None, SMALL), tmp_path / "again.mcap")
     comparison = compare(session, again.path, only=["inputs", "outputs", "truth", "configuration", "chip"])
@@ -222,6 +223,7 @@ def test_a_run_can_not_smooth_what_is_still_to_come() -> None:
         record(load_config(None, [*SMALL, "sampler.method=smoothed"]))
 
 
+@pytest.mark.slow("replays a mission with another controller")
 def test_another_controller_changes_the_commands_and_nothing_before_them(session: Path) -> None:
     done = verb.replay_session(session, Change(controller="ff_fb"))
     topics = done.comparison.topics
@@ -274,6 +276,7 @@ def test_an_existing_output_is_not_overwritten(session: Path) -> None:
         verb.replay_session(session, Change(), out=session)
 
 
+@pytest.mark.slow("verifies a mission in two processes")
 def test_a_verification_in_segments_covers_every_tick(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay_segments, "_TICKS", 100)
     done = replay_segments.verify(session, jobs=2)

@@ -158,6 +158,7 @@ def cells(path: Path) -> set[tuple[str, ...]]:
     return {cell for cell in found if cell[-1] != "None"}
 
 
+@pytest.mark.slow("logs a mission twice")
 def test_a_file_holds_what_a_live_viewer_is_sent_row_by_row(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
     ticks = [
         replace(tick, truth=tick.truth if number % 3 else None) for number, tick in enumerate(ticks)

@@ -159,6 +159,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         process._end()
 
 
+@pytest.mark.slow("waits for processes that hang")
 def test_what_hangs_eats_memory_or_kills_its_process_is_named_and_the_rest_is_done(
     planted: None, tmp_path: Path
 ) -> None:

@@ -132,6 +132,7 @@ def test_a_rig_that_stays_back_in_time_ends_the_run_because_nobody_steers(tmp_pa
         flown(tmp_path / "s.mcap", lost=10, duration_s=5.0, _frames=100)
 
 
+@pytest.mark.slow("flies a mission whose clocks are set")
 def test_wall_clocks_set_in_a_run_are_in_its_verdict_and_nothing_else_changes(tmp_path):
     calm, troubled = TwoClocks(), TwoClocks()
 
@@ -203,6 +204,7 @@ with SessionWriter(sys.argv[1], HEADER) as writer:
 """
 
 
+@pytest.mark.slow("a mission in a process with another clock")
 @pytest.mark.skipif(sys.platform != "linux" or shutil.which("cc") is None, reason="needs a C compiler and Linux")
 def test_a_clock_really_set_back_an_hour_neither_delays_a_flush_nor_touches_a_stamp(tmp_path):
     (tmp_path / "shim.c").write_text(SHIM)

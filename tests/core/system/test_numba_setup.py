@@ -87,6 +87,7 @@ def test_kernels_need_neither_a_writable_home_nor_a_writable_installation(packag
     assert done.stdout.split() == ["6", "0"]
 
 
+@pytest.mark.slow("compiles kernels in a process of its own")
 def test_the_folder_that_numba_was_told_is_used_and_what_nobody_has_used_for_long_is_removed(
     package: Path, tmp_path: Path
 ) -> None:

@@ -250,6 +250,7 @@ def test_a_writer_waits_for_one_who_only_asks_and_then_holds_its_lock(tmp_path):
         assert is_locked(partial)
 
 
+@pytest.mark.slow("begins sixty sessions")
 def test_sixty_sessions_begun_beside_one_who_asks_without_end_hold_their_locks(tmp_path):
     partial = tmp_path / "x.mcap.partial"
     asking = (

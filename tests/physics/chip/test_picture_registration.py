@@ -125,6 +125,7 @@ def test_the_overlay_is_drawn_on_the_walls():
     assert np.percentile(np.abs(distance[inside]), 95) < 30.0
 
 
+@pytest.mark.slow("searches a picture for every angle")
 def test_a_symmetric_chip_has_two_poses_and_none_is_chosen():
     chip = load_chip(ChipSettings("bifurcation"))
     _, image = seen("dark lines", 10.0, chip=chip)
@@ -133,6 +134,7 @@ def test_a_symmetric_chip_has_two_poses_and_none_is_chosen():
     assert abs(fits[0].explained - fits[1].explained) < 0.01
 
 
+@pytest.mark.slow("searches a picture along a channel")
 def test_a_straight_channel_does_not_tell_where_along_it_the_image_is(monkeypatch):
     monkeypatch.setattr("flowrec.measure.picture_registration._CANDIDATES", 2)  # of a dozen that are all alike
     chip = load_chip(ChipSettings("straight"))
@@ -141,6 +143,7 @@ def test_a_straight_channel_does_not_tell_where_along_it_the_image_is(monkeypatc
         register(image, chip, ABOUT, (False,))
 
 
+@pytest.mark.slow("registers pictures of other things")
 def test_other_pictures_are_refused(monkeypatch):
     monkeypatch.setattr("flowrec.measure.picture_registration._FIRST", 1)  # the first candidate tells as much as three
     _, image = seen("dark lines", 5.0, chip=load_chip(ChipSettings("vessels", seed=5)))

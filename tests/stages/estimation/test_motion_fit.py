@@ -206,6 +206,7 @@ def test_without_changes_of_the_command_nothing_is_claimed() -> None:
         fit(np.arange(5.0), np.zeros((5, 2)), log)
 
 
+@pytest.mark.slow("fits many movies")
 def test_stated_errors_hold() -> None:
     """95 of 100 within 1.96 standard errors; and they are not far too large, and larger where less is to be seen."""
     deviations, errors = [], []

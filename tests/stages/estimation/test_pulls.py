@@ -163,6 +163,7 @@ def test_observations_of_the_smoother_state_their_errors_and_neighbours_have_err
     assert np.mean([(pull[1:] * pull[:-1]).mean() for pull in pulls]) < 0.08  # 0.04 is the error of this mean
 
 
+@pytest.mark.slow("many flights of the observer")
 def test_a_run_of_observations_states_the_error_of_its_mean_and_each_of_them_twice_its_own(
     surveys: list[tuple[Swim, list[Estimate], Observations]],
 ) -> None:

@@ -154,6 +154,7 @@ def test_the_same_input_gives_the_same_bytes_and_keeps_stamp_and_request(twin):
     assert (first.stamp_ns, first.request) == (77, 5)
 
 
+@pytest.mark.slow("refines twice without cached results")
 def test_the_cache_changes_no_result(twin):
     case = twin(scale=300.0)
     doubled = replace(case.observations, flow_um_s=2.0 * case.observations.flow_um_s)
@@ -164,6 +165,7 @@ def test_the_cache_changes_no_result(twin):
     assert warm.same_as(cold)
 
 
+@pytest.mark.slow("refines four times")
 def test_copies_of_an_observation_count_once_and_a_std_that_is_too_small_is_widened(twin):
     case = twin()
     plain = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)

@@ -33,7 +33,7 @@ def misfit(case, field):
     return float(((operator.predict(field.velocity_um_s.reshape(-1, 2)) - operator.flow_um_s) ** 2).sum())
 
 
-@pytest.mark.parametrize("method", QUICK)
+@pytest.mark.parametrize("method", [pytest.param("ni", marks=pytest.mark.slow("fits a U-Net twice")), "pinn"])
 def test_a_baseline_explains_its_observations_and_keeps_the_promises_of_a_refinement(twin, method):
     case = twin()
     threads, random = torch.get_num_threads(), torch.get_rng_state()

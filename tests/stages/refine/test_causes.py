@@ -197,6 +197,7 @@ def test_observations_without_motion_and_time_are_assimilated_as_those_of_older_
     assert case.error(refined) < 0.04
 
 
+@pytest.mark.slow("refines several surveys")
 def test_the_expected_error_is_as_large_as_the_error_over_several_surveys(twin):
     case = twin()
     errors, expected = [], []

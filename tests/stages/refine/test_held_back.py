@@ -78,6 +78,7 @@ def test_a_map_in_use_that_predicts_better_stays_with_both_scores_and_the_reason
     assert Refiner(method, adopt="always").choose(found, in_use) is found
 
 
+@pytest.mark.slow("refines three times")
 def test_a_map_in_use_is_tested_on_what_was_made_after_it_alone(twin):
     case = twin()
     made = case.observations

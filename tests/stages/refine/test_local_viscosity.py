@@ -77,6 +77,7 @@ def test_the_flow_of_the_solver_satisfies_the_equations_of_its_law_only(flows):
     assert size(chip) < 0.5 * size(replace(chip, law=None))
 
 
+@pytest.mark.slow("balances a flow of two laws")
 def test_balancing_with_the_law_is_better_than_without(flows):
     chip, assumed, truth, operator = flows
 

@@ -89,6 +89,7 @@ def test_the_survey_doubts_the_branch_that_carries_too_little_and_then_the_place
     assert free.doubts.probability.sum() < 0.2
 
 
+@pytest.mark.slow("refines with every doubt about the chip")
 def test_where_nothing_is_blocked_the_map_is_that_of_the_assimilation(chip, assumed):
     values = chip.boundary_values * np.array([1.2, 1.0])
     truth = SOLVER.solve(chip.with_boundary(values))

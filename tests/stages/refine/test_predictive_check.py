@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from flowrec.core.messages import FlowField, Observations
 from flowrec.stages.refine import Refiner
@@ -69,6 +70,7 @@ def test_a_wander_of_the_flow_is_no_explanation_and_is_not_said_beside_what_noth
     assert not [clause for clause in field.note.split("; ") if clause.startswith(TAKEN_FOR)]
 
 
+@pytest.mark.slow("refines surveys of many seeds")
 def test_chance_and_single_outliers_are_no_departure(twin):
     for seed, every in ((0, 1), (1, 1), (2, 3)):
         case = twin(every=every, seed=seed)
@@ -95,6 +97,7 @@ def test_a_robot_that_moves_less_in_one_direction_is_said_with_the_direction_and
     assert UNEXPLAINED not in refine(case, swimming(case.observations, 1)).note
 
 
+@pytest.mark.slow("refines surveys with an unsteady pump")
 def test_what_an_unsteady_pump_explains_is_said_of_the_pump(twin):
     case = twin(every=1)
     time_s = 0.6 * np.arange(len(case.observations.std_um_s))

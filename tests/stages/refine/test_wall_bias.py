@@ -61,6 +61,7 @@ def test_offsets_are_tried_at_steps_and_never_beyond_the_largest():
     assert [nearest_offset(found) for found in (0.1, -0.3, 0.8, 7.0)] == [0.0, -0.5, 1.0, 2.0]
 
 
+@pytest.mark.slow("solves the flow of three vessels between other walls")
 def test_a_threshold_that_is_off_by_a_fraction_of_a_pixel_is_found_with_the_flow_through_the_true_walls():
     chip, solver = channel(), FlowSolver(2)
     true = solver.solve(with_wall_offset(chip, 0.7))
