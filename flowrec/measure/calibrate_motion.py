@@ -42,6 +42,29 @@ class MotionCalibration:
     sets: dict[str, float | bool]  # settings by key
     advice: tuple[str, ...]
     covered: Coverage  # images in which the robot was seen, of all
+    path: Path  # of the session
+    out: Path | None  # that the settings were written to
+
+    def as_json(self) -> dict[str, Any]:
+        """The fit as plain numbers; None where the movie does not determine one."""
+        return figures_of(self.fit) | {
+            "log": self.log,
+            "shared_clock": self.shared_clock,
+            "advice": list(self.advice),
+            "set": as_sets(self.sets),
+            "covered": self.covered.as_json(),
+        }
+
+    def show(self) -> None:
+        """Print the fit as a table, advice and settings."""
+        rows = rows_of(self.fit, shared_clock=self.shared_clock)
+        table(f"{self.path.name} against {self.log}", ("", "value and standard error"), rows)
+        for sentence in self.advice:
+            say(f"- {sentence}")
+        say(self.covered.amount)
+        if self.out is not None:
+            say(f"{self.out} written")
+        say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(self.sets)))
 
 
 def calibrate_motion(
@@ -83,10 +106,11 @@ def calibrate_motion(
     shared = coils is None and not imported
     sets, advice = _propose_settings(fit, session, shared_clock=shared, own_log=coils is None)
     covered = Coverage(len(tracks), len(every), "images", "show the robot")
-    motion = MotionCalibration(fit, name, shared, sets, advice, covered)
     if outputs:
-        write_outputs(outputs, (fragment(motion, path).encode(),))
-    return motion
+        source = f"By flowrec {__version__} calibrate motion from {path.name} and {name}."
+        comments = (source, *(f"{key}: {value}" for key, value in rows_of(fit)))
+        write_outputs(outputs, (as_toml(comments, dict(sorted(sets.items()))).encode(),))
+    return MotionCalibration(fit, name, shared, sets, advice, covered, path, out)
 
 
 def fit_log(
@@ -263,13 +287,6 @@ def remarks(fit: MotionFit) -> list[str]:
     return sentences
 
 
-def fragment(motion: MotionCalibration, path: Path) -> str:
-    """The settings as TOML, with a comment on their source."""
-    comments = (f"{name}: {value}" for name, value in rows_of(motion.fit))
-    source = f"By flowrec {__version__} calibrate motion from {path.name} and {motion.log}."
-    return as_toml((source, *comments), dict(sorted(motion.sets.items())))
-
-
 def rows_of(fit: MotionFit, offset: tuple[str, str] | None = None, shared_clock: bool = False) -> list[tuple[str, str]]:
     """The fit for people, each value with its standard error; `offset`: another row for the offset."""
     name, factor = ("latency", -1e3) if shared_clock else ("time of log less time of movie", 1e3)
@@ -293,17 +310,6 @@ def rows_of(fit: MotionFit, offset: tuple[str, str] | None = None, shared_clock:
     return rows
 
 
-def figures(motion: MotionCalibration) -> dict[str, Any]:
-    """The fit as plain numbers; None where the movie does not determine one."""
-    return figures_of(motion.fit) | {
-        "log": motion.log,
-        "shared_clock": motion.shared_clock,
-        "advice": list(motion.advice),
-        "set": as_sets(motion.sets),
-        "covered": motion.covered.as_json(),
-    }
-
-
 def figures_of(fit: MotionFit) -> dict[str, Any]:
     """The fit as plain numbers."""
     values: dict[str, Any] = {
@@ -325,15 +331,3 @@ def figures_of(fit: MotionFit) -> dict[str, Any]:
         "refusal": fit.refusal,
     }
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
-
-
-def show(motion: MotionCalibration, path: Path, out: Path | None) -> None:
-    """Print the fit as a table, advice and settings."""
-    rows = rows_of(motion.fit, shared_clock=motion.shared_clock)
-    table(f"{path.name} against {motion.log}", ("", "value and standard error"), rows)
-    for sentence in motion.advice:
-        say(f"- {sentence}")
-    say(motion.covered.amount)
-    if out is not None:
-        say(f"{out} written")
-    say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(motion.sets)))

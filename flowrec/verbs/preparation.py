@@ -231,18 +231,17 @@ def place_of_session(config: Config, out: Path | None, overwrite: bool) -> Path:
     return path
 
 
-def default_path(config: Config, folder: Path | None = None) -> Path:
-    """The path date_operator_sample_number.mcap with the first free number."""
+def default_path(config: Config) -> Path:
+    """The path date_operator_sample_number.mcap with the first free number, in this folder."""
     sample = config.recording.sample or Path(config.chip.path).stem or config.chip.name
     words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
     stem = "_".join(word.replace(" ", "-") for word in words if word)
-    folder = folder or Path()
-    names = runs_in(folder)
+    names = runs_in(Path())
     for number in range(1, 10_000):
-        path = folder / f"{stem}_{number:03d}.mcap"
+        path = Path(f"{stem}_{number:03d}.mcap")
         if path not in names:
             return path
-    raise SessionError(f"{folder}: 9999 sessions named {stem} are here; name one with --out")
+    raise SessionError(f".: 9999 sessions named {stem} are here; name one with --out")
 
 
 def guard_timeout_s(config: ResolvedConfig) -> float:
