@@ -28,7 +28,7 @@ from flowrec.store import Session, files_behind, input_blamed, named_beside, ses
 from flowrec.verbs.check import check
 from flowrec.verbs.info import facts_for_people, info
 from flowrec.verbs.replay_change import OF_EVERY_REPLAY
-from flowrec.verbs.replay_made import refinement_remarks
+from flowrec.verbs.replay_result import refinement_remarks
 from flowrec.verbs.session_parts import flat
 from flowrec.verbs.verdict import Verdict
 

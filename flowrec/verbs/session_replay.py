@@ -60,7 +60,7 @@ from flowrec.store import (
 from flowrec.verbs.comparison import Comparison, Side
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.replay_change import Change
-from flowrec.verbs.replay_result import Replayed, WorkerCheck, WorkerResults, coverage_of, digest_lines
+from flowrec.verbs.replay_result import Replay, WorkerCheck, WorkerResults, coverage_of, digest_lines
 from flowrec.verbs.run_summary import figures_of, judges_of
 
 
@@ -75,7 +75,7 @@ def replay_session(
     control: Unattended | None = None,
     *,
     segment_ns: tuple[int | None, int] | None = None,
-) -> Replayed:
+) -> Replay:
     """Replay a session, in any thread; write the result to a new session if `out` is given.
 
     Parameters
@@ -114,6 +114,7 @@ def replay_session(
             result.doubts = [doubt for judge in judges for doubt in judge.doubts()]
             result.doubts += map_doubts(refined, result.config.camera.um_per_px) if refined is not None else []
             _close(writer, result)
+            result.file = out
     if verify and segment_ns is None:
         replay.read_digest(result)
     return result
@@ -189,7 +190,7 @@ class _Replay:
         self._progress = stack.enter_context(self.control.progress(f"replaying {self.session.path.name}", length_s))
         self._worker.announce = self._progress.stage
 
-    def run(self, sinks: list[Sink]) -> Replayed:
+    def run(self, sinks: list[Sink]) -> Replay:
         """Replay all ticks; the first of the sinks also takes results that the recording ended too early for."""
         control = self.control.run_control
         with self.control.end_on_signals():
@@ -215,7 +216,7 @@ class _Replay:
                 last = control.unless_stopped(closing, last)
             if last is not report.last and sinks:
                 sinks[0].write(last)
-        return Replayed(
+        return Replay(
             self.session,
             self.config,
             report,
@@ -240,7 +241,7 @@ class _Replay:
         self._commands.add(recorded.demand, tick.demand)
         self._progress(seconds(tick.stamp_ns - self._first_ns))
 
-    def read_digest(self, result: Replayed) -> None:
+    def read_digest(self, result: Replay) -> None:
         """Compare the files of the session with their digests."""
         control = self.control.run_control
         with self.control.end_on_signals():
@@ -271,7 +272,7 @@ def _between_ns(
     return start_ns, end_ns
 
 
-def _close(writer: SessionWriter, result: Replayed) -> None:
+def _close(writer: SessionWriter, result: Replay) -> None:
     """Close the file of a replay with its figures, its doubts and how it ended."""
     covered = result.covered
     ended = Outcome.STOPPED if covered.stopped else Outcome.REPLAYED
