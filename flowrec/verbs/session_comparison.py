@@ -50,29 +50,39 @@ class SessionComparison:
     ----------
     names : of the two files.
     choice : what was asked for.
-    covered : the ticks, topics and parts of the head that were compared.
+    total : the ticks of the longer one.
     bytes_alike : size of two files that are the same byte for byte, of which nothing else was compared; else None.
     head : its parts.
     comparison : of the messages, tick by tick.
     apart : topics, or fields of topics, that differ as a whole: held by one file only, declared otherwise. A text each.
     raw : topics that are compared as they are in the file: messages that are the same, that differ, and text.
+    topics : that were compared.
     by_nature : what differs between any two runs, and does here; as names for --ignore.
+    ended : what stopped it early.
     """
 
     names: tuple[str, str]
     choice: Choice
-    covered: Coverage
+    total: int
     bytes_alike: int | None = None
     head: list[PartOfHead] = field(default_factory=list)
     comparison: Comparison = field(default_factory=Comparison)
     apart: dict[str, str] = field(default_factory=dict)
     raw: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    topics: tuple[str, ...] = ()
     by_nature: tuple[str, ...] = ()
+    ended: Ended | None = None
 
     @property
-    def ticks(self) -> int:
-        """Ticks that were compared."""
-        return self.comparison.ticks
+    def covered(self) -> Coverage:
+        """The ticks, topics and parts of the head that were compared."""
+        if self.bytes_alike is not None:
+            return Coverage(self.total, self.total, topics=self.topics, head=HEAD)
+        done, head = self.comparison.ticks, tuple(dict.fromkeys(part.name for part in self.head))
+        covered = Coverage(done, done, topics=self.topics, head=head)
+        if self.ended is None:
+            return covered
+        return replace(covered, total=max(done, self.total), stopped=self.ended.why, status=self.ended.status)
 
     @property
     def first(self) -> Difference | None:
@@ -87,7 +97,7 @@ class SessionComparison:
     @property
     def same(self) -> bool | None:
         """All that was asked for is the same within its tolerance; None if it was stopped before a difference."""
-        return None if self.covered.stopped and self.same_so_far else self.same_so_far
+        return None if self.ended is not None and self.same_so_far else self.same_so_far
 
     @property
     def identical(self) -> bool | None:
@@ -97,7 +107,7 @@ class SessionComparison:
     @property
     def exit_status(self) -> int:
         """0 the same, 3 something differs, 130 or 143 stopped."""
-        return self.covered.status if self.covered.stopped else 0 if self.same else 3
+        return self.ended.status if self.ended is not None else 0 if self.same else 3
 
     def lines(self) -> list[str]:
         """A line for each topic and part of the head, hints, and the verdict."""
@@ -130,10 +140,12 @@ class SessionComparison:
         if not self.same_so_far:
             other = self.comparison.other_numerics
             different = self._different
-            more = [f"{len(different) - _NAMED} more"] if len(different) > _NAMED else []
-            found = f"DIFFERENT in {', '.join([*different[:_NAMED], *more])}" + (f"; {other}" if other else "")
-        what = f"{_count_of(self.covered.topics, 'topic')} and {_count_of(self.covered.head, 'part')} of the head"
-        return f"{self.covered.sentence(found)} ({what}{self.choice.text})"
+            if len(different) > _NAMED:
+                different[_NAMED:] = [f"{len(different) - _NAMED} more"]
+            found = f"DIFFERENT in {', '.join(different)}" + (f"; {other}" if other else "")
+        covered = self.covered
+        what = f"{_count_of(covered.topics, 'topic')} and {_count_of(covered.head, 'part')} of the head"
+        return f"{covered.sentence(found)} ({what}{self.choice.text})"
 
     @property
     def _different(self) -> list[str]:
@@ -165,15 +177,11 @@ def compare_sessions(
 ) -> SessionComparison:
     """Compare two sessions; parameters and errors as of `flowrec.compare`."""
     names = _names(*sessions)
-    found = SessionComparison(
-        names, choice, Coverage(0, max(each.reader.counts.get("applied", 0) for each in sessions))
-    )
+    found = SessionComparison(names, choice, max(each.reader.counts.get("applied", 0) for each in sessions))
     try:
-        size_bytes = None if choice.text else _same_bytes(*sessions)
-        if size_bytes is not None:
-            found.bytes_alike = size_bytes
-            topics = tuple(sessions[0].topics)
-            found.covered = replace(found.covered, done=found.covered.total, topics=topics, head=HEAD)
+        found.bytes_alike = None if choice.text else _same_bytes(*sessions)
+        if found.bytes_alike is not None:
+            found.topics = tuple(sessions[0].topics)
             return found
         _compare_heads(found, sessions)
         raw = raw_topics(sessions[0], choice), raw_topics(sessions[1], choice)
@@ -183,12 +191,9 @@ def compare_sessions(
         _compare_unread(found, sessions, raw)
         _compare_digests(found, sessions)
     except KeyboardInterrupt as error:
-        ended = Ended.of(error)
-        done, total = found.ticks, max(found.ticks, found.covered.total)
-        found.covered = replace(found.covered, done=done, total=total, stopped=ended.why, status=ended.status)
-        ended.result = found
-        raise ended from error
-    found.covered = replace(found.covered, done=found.ticks, total=found.ticks)
+        found.ended = Ended.of(error)
+        found.ended.result = found
+        raise found.ended from error
     found.by_nature = _by_nature(found)
     return found
 
@@ -223,7 +228,6 @@ def _compare_heads(found: SessionComparison, sessions: tuple[Session, Session]) 
     heads = [head_of(session) for session in sessions]
     found.choice.check([*heads[0], *heads[1], *(name for each in sessions for name in declared_topics(each))])
     found.head = compared_heads(heads, found.names, found.choice)
-    found.covered = replace(found.covered, head=tuple(part.name for part in found.head))
 
 
 def _compare_raw(found: SessionComparison, raw: Raws) -> None:
@@ -236,13 +240,13 @@ def _compare_raw(found: SessionComparison, raw: Raws) -> None:
             continue
         same, wrong, stamp_ns = was[topic].same_as(now[topic])
         found.raw[topic] = (same, wrong, f", {wrong} DIFFERENT{at_text(stamp_ns)}" if wrong else "")
-    found.covered = replace(found.covered, topics=tuple(dict.fromkeys((*was, *now))))
+    found.topics = tuple(dict.fromkeys((*was, *now)))
 
 
 def _compare_declared(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
     """Compare what the topics declare that both hold: encoding, depth, region, role, and the schema."""
     was, now = (declared_topics(session) for session in sessions)
-    for topic in found.covered.topics:
+    for topic in found.topics:
         if topic not in was or topic not in now or topic in found.apart:
             continue
         keys = [key for key in {**was[topic], **now[topic]} if was[topic].get(key) != now[topic].get(key)]
@@ -299,7 +303,7 @@ def _compare_ticks(
             lone = sorted(known[side] - known[1 - side])
             if lone:
                 found.apart[topic.path] = f"{', '.join(lone)}: only in {found.names[side]}"
-    found.covered = replace(found.covered, topics=(*compared, *found.covered.topics))
+    found.topics = (*compared, *found.topics)
     sides = Side.of("first", sessions[0]), Side.of("second", sessions[1])
     found.comparison = comparison = Comparison(tuple(Role), sides, frozenset(left_out))
     comparison.not_recorded.clear()  # told above, where one of the two has it

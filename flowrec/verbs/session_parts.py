@@ -145,10 +145,11 @@ class PartOfHead:
         """A line of text."""
         if not self.differences:
             return printable(f"{self.name:{width}s}  identical")
-        shown = [f"{key} {text}".strip() for key, text in list(self.differences.items())[:_NAMED]]
-        more = len(self.differences) - len(shown)
-        listed = "; ".join([*shown, *([f"{more} more"] if more else [])])
-        return printable(f"{self.name:{width}s}  {len(self.differences)} of {self.items} DIFFERENT: {listed}")
+        shown = [f"{key} {text}".strip() for key, text in self.differences.items()]
+        if len(shown) > _NAMED:
+            shown[_NAMED:] = [f"{len(shown) - _NAMED} more"]
+        count = f"{len(self.differences)} of {self.items}"
+        return printable(f"{self.name:{width}s}  {count} DIFFERENT: {'; '.join(shown)}")
 
 
 def compared_heads(
