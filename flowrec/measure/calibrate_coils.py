@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flowrec.core import Coverage, __version__, say, table
-from flowrec.measure.coil_calibration import CoilFit, Floats, advice, fit_coils, read_excitations
+from flowrec.core import Coverage, Floats, __version__, say, table
+from flowrec.measure.coil_calibration import CoilFit, advice, fit_coils, read_excitations
 from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outputs
+from flowrec.rigs import sha256_of
 from flowrec.stages import Coils
 
 _EXACT_DIGITS = 9
@@ -92,7 +92,7 @@ def calibrate_coils(path: Path, out: Path | None = None, overwrite: bool = False
     settings = settings_of(fit)
     Coils(mt_per_a=settings["coils.mt_per_a"], bias_mt=settings["coils.bias_mt"]).check(path.name)
     if outputs:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+        digest = sha256_of(path)[:12]
         noise = ", ".join(f"{value:.2g}" for value in fit.noise_mt)
         suspects = f"; {len(fit.suspects)} of them suspicious" if fit.suspects else ""
         comments = (

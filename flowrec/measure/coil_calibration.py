@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from flowrec.core import UsageError, refuse_irregular
+from flowrec.core import Floats, UsageError, refuse_irregular
 from flowrec.stages import WORST_CONDITION, direction_name
 
-Floats = NDArray[np.float64]
 _COLUMNS = ("i_x_a", "i_y_a", "i_z_a", "b_x_mt", "b_y_mt", "b_z_mt")
 _HEADER = ",".join(_COLUMNS)
 _UNIT_NAMES = {"a": "ampere", "mt": "millitesla"}

@@ -112,19 +112,17 @@ def admit(
     if not isinstance(rig, Tried) or control.reason:
         return {}
     known = _after_first_order(rig, pipeline, worker, known, control)
-    best: Held | None = None
-    for _ in range(_TRIES):
+    trials: list[Held] = []
+    while len(trials) < _TRIES and not any(held.enough for held in trials):
         with _scratch(folder, config, chip) as writer:
             held = _trial(rig, pipeline, writer, known, config, control)
         if held is None:
             return {}
-        best = held if best is None or held.hz > best.hz else best
-        if best.enough:
-            break
-    assert best is not None
-    if not best.enough and not config.recording.accept_losses:
-        raise RigError(refusal(best, config, folder))
+        trials.append(held)
+    best = max(trials, key=lambda held: held.hz)
     if not best.enough:
+        if not config.recording.accept_losses:
+            raise RigError(refusal(best, config, folder))
         warn(f"this machine holds {best}: images will be lost (--accept-losses)")
     return {"admission": f"holds {best}"}
 

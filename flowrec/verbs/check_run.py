@@ -37,25 +37,28 @@ def files_to_check(path: Path) -> list[Path]:
 
 
 def check_session(
-    path: Path, files: Sequence[Path], progress: Callable[[int], None] | None, signers: Path | None = None
+    path: Path, files: Sequence[Path], progress: Callable[[int], None], signers: Path | None = None
 ) -> Verdict:
     """The verdict on the files of a session; parameters and errors as of `flowrec.check`."""
     total = sum(map(size_of, files))
     checks: list[FileCheck] = []
+
+    def read_bytes() -> int:
+        return sum(check.read_bytes for check in checks)
+
     for file in files:
-        before = sum(check.read_bytes for check in checks)
-        check = FileCheck(file, progress, before)
+        check = FileCheck(file, lambda: progress(read_bytes()))
+        checks.append(check)
         try:
             check.read()
         except KeyboardInterrupt as error:
             ended = Ended.of(error)
-            covered = Coverage(before + check.read_bytes, total, "bytes", stopped=ended.why, status=ended.status)
-            ended.result = _verdict_so_far(path, covered, [*checks, check])
+            covered = Coverage(read_bytes(), total, "bytes", stopped=ended.why, status=ended.status)
+            ended.result = _verdict_so_far(path, covered, checks)
             raise ended from error
-        checks.append(check)
         _check_signature(check.verdict, signers)
     verdict = checks[0].verdict if list(files) == [path] else _check_run(path, checks)
-    verdict.covered = Coverage(sum(check.read_bytes for check in checks), total, "bytes", topics=tuple(verdict.topics))
+    verdict.covered = Coverage(read_bytes(), total, "bytes", topics=tuple(verdict.topics))
     if all(check.found.header is not None for check in checks):
         verdict.covered = replace(verdict.covered, head=HEAD)
     amount, topics = verdict.covered.amount, len(verdict.topics)

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, PICTURE, Frame, Image, Output, Track, UsageError, say, seconds, shift_px
+from flowrec.core import NS_PER_S, PICTURE, Floats, Frame, Image, Output, Track, UsageError, say, seconds, shift_px
 from flowrec.rigs import MovieSource
 from flowrec.stages import (
     MOST,
@@ -41,8 +41,6 @@ _SHAKES_PX = 0.1  # root mean square from which on it is told; half a pixel is w
 _PX = "px"
 _SIDE_PX = 1200  # of the picture of candidates, about
 _AMBER, _BLACK = (38, 140, 255), (0, 0, 0)  # blue, green, red
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -89,14 +89,4 @@ def import_movie(
     asked = asked_import(movie, chosen, coils=coils, times=times, fps=fps, partial=partial)
     path = None if out is None else Path(out)
     looked = fit_import(asked, path.parent if path is not None else Path(), str(robot), align=align)
-    return run_mission(
-        looked.asked,
-        path,
-        overwrite=overwrite,
-        control=control,
-        inputs=inputs,
-        keep_failed=False,
-        given_facts=looked.facts,
-        known=looked.prepared,
-        given_doubts=looked.doubts,
-    )
+    return run_mission(looked.asked, path, overwrite=overwrite, control=control, inputs=inputs, looked=looked)

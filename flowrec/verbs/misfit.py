@@ -18,9 +18,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import AxesVerdict, ChipError, FlowField, nanoseconds
+from flowrec.core import AxesVerdict, ChipError, Floats, FlowField, nanoseconds
 from flowrec.measure import ImageVerdict, sampled_s
 from flowrec.physics import Calibration, Chip, Orientation, nearest, sample
 from flowrec.stages import (
@@ -40,8 +39,6 @@ _LEAST_WINDOWS = 4
 _HIDES_PX = 0.5  # root mean square from which on shake hides the commands; 1 px at 3 Hz does in simulated movies
 _STILL = 0.15  # of the speed that the log drives
 _CARRIED = 0.8  # share of the motion that the flow explains, from which on the body is not driven
-
-Floats = NDArray[np.float64]
 
 
 def why_unexplained(seen: MovieTracks, flow: FlowField, um_per_rev: float) -> str:
