@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from flowrec.core import (
     DOUBTS,
+    FlowField,
     Level,
     Outcome,
     Output,
@@ -220,15 +221,17 @@ def _sentence(text: str) -> str:
 def _about(facts: dict[str, Any], session: Session) -> str:
     """Time, place and equipment of the run, in one line."""
     rig = {"simulated": "in simulation", "movie": "from a movie", "lab": "in the laboratory"}
-    parts = [f"recorded {str(facts['recorded'])[:16].replace('T', ' ')} UTC"]
-    if facts["replay_of"]:
-        parts[0] = f"replay of {facts['replay_of']}, made {str(facts['recorded'])[:16].replace('T', ' ')} UTC"
-    parts += [rig.get(str(facts["rig"]), f"rig {facts['rig']}"), f"chip {facts['chip']}"]
-    parts.append(f"{session.duration_s:.1f} s")
-    for key in ("operator", "sample"):
-        if facts.get(key):
-            parts.append(f"{key}: {facts[key]}")
-    return ", ".join(parts)
+    when = f"{str(facts['recorded'])[:16].replace('T', ' ')} UTC"
+    made = f"replay of {facts['replay_of']}, made {when}" if facts["replay_of"] else f"recorded {when}"
+    where = rig.get(str(facts["rig"]), f"rig {facts['rig']}")
+    named = (f"{key}: {facts[key]}" for key in ("operator", "sample") if facts.get(key))
+    return ", ".join([made, where, f"chip {facts['chip']}", f"{session.duration_s:.1f} s", *named])
+
+
+def _maps(data: ReportData) -> dict[str, FlowField]:
+    """The flow maps that the session holds."""
+    named = {"assumed": data.assumed, "refined": data.refined}
+    return {name: field for name, field in named.items() if field is not None}
 
 
 def _key_figures(data: ReportData) -> ReportTable:
@@ -238,13 +241,13 @@ def _key_figures(data: ReportData) -> ReportTable:
     figures = {"duration_s": session.duration_s} | {
         key: value for key, value in session.outcome.items() if key not in _HIDDEN and value not in (None, "")
     }
-    for name, field in (("assumed", data.assumed), ("refined", data.refined)):
+    for name, field in _maps(data).items():
         error = flow_error(data.scene.chip, field, data.truth)
         if error is not None:  # of a run that was cut off, its last tick instead of its figures
             figures.setdefault(f"{name}_flow_error", error)
     rows = [(name_of(key), _micro(text_of_figure(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
-    for name, field in (("assumed", data.assumed), ("refined", data.refined)):
-        if field is not None and field.error_share is not None:
+    for name, field in _maps(data).items():
+        if field.error_share is not None:
             text = text_of_figure("_error", field.error_share)
             rows.append((f"{name} flow, stated error", text, f"what the {name} map expects its error to be"))
     if data.truth is None:
@@ -261,8 +264,7 @@ def _boundary(data: ReportData) -> ReportTable | None:
     """Inflow and pressure at the openings of the chip, before and after."""
     from flowrec.exports import ReportTable
 
-    named = {"assumed": data.assumed, "refined": data.refined, "true": data.truth}
-    fields = {name: field for name, field in named.items() if field is not None}
+    fields = _maps(data) | ({"true": data.truth} if data.truth is not None else {})
     openings = data.scene.chip.openings
     if any(len(field.boundary_values) != len(openings) for field in fields.values()) or not fields:
         return None
@@ -296,32 +298,27 @@ def _events(data: ReportData) -> list[ReportTable]:
     from flowrec.exports import ReportTable, numbered_actions
 
     history = data.history
-    tables: list[ReportTable] = []
-
-    def add(title: str, rows: Sequence[tuple[Any, ...]], columns: tuple[str, ...], left_out: int = 0) -> None:
-        more = max(len(rows) - _EVENTS, 0) + left_out
-        note = f"The first {_EVENTS} of {len(rows) + left_out}; the session holds all." if more else ""
-        if rows:
-            tables.append(ReportTable(title, rows[:_EVENTS], columns, note))
-
-    add(
-        "The operator",
-        [
-            (number, f"{each.time_s:.2f} s", each.action, each.text)
-            for number, each in numbered_actions(history.remarks)
-        ],
-        ("number", "time", "action", "text"),
-    )
+    actions = [
+        (number, f"{each.time_s:.2f} s", each.action, each.text) for number, each in numbered_actions(history.remarks)
+    ]
     events = [
         (f"{each.time_s:.2f} s", each.text if each.level == Level.INFO else f"{each.level}: {each.text}")
         for each in history.remarks
         if not each.action
     ]
-    add("Events", events, ("time", "event"), history.remarks_left_out)
     spans = history.phases.spans
     phases = [(span.name, f"{span.from_s:.2f} s", f"{span.to_s - span.from_s:.2f} s") for span in spans]
-    add("Phases of the mission", phases, ("phase", "from", "for"))
-    return tables
+    tables: list[tuple[str, Sequence[tuple[Any, ...]], tuple[str, ...], int]] = [
+        ("The operator", actions, ("number", "time", "action", "text"), 0),
+        ("Events", events, ("time", "event"), history.remarks_left_out),
+        ("Phases of the mission", phases, ("phase", "from", "for"), 0),
+    ]
+    made = []
+    for title, rows, columns, left_out in tables:
+        total = len(rows) + left_out
+        note = f"The first {_EVENTS} of {total}; the session holds all." if total > min(len(rows), _EVENTS) else ""
+        made += [ReportTable(title, rows[:_EVENTS], columns, note)] if rows else []
+    return made
 
 
 def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]]:
@@ -343,12 +340,13 @@ def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
         (name_of(key), _micro(text_of_figure(key, was)), _micro(text_of_figure(key, now)), MEANINGS.get(key, ""))
         for key, was, now in [*before_after(pair), stated]
     ]
-    tables = [ReportTable("Before and after", texts, ("", "recorded", "replayed", ""), narrow_columns=3)]
     changed = _changed_settings(pair)
+    of_changed = ("setting", "recorded", "replayed") if changed else ()
     note = "" if changed else "The replay has the settings and the code of the recording."
-    tables.append(
-        ReportTable("What was changed", changed, ("setting", "recorded", "replayed") if changed else (), note)
-    )
+    tables = [
+        ReportTable("Before and after", texts, ("", "recorded", "replayed", ""), narrow_columns=3),
+        ReportTable("What was changed", changed, of_changed, note),
+    ]
     return ReplayPart(pair.replay.path.name, tables, refinement_remarks(pair), figure)
 
 

@@ -7,7 +7,7 @@ ran; that is told as every other difference is, with the option that leaves it o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from heapq import merge
@@ -28,7 +28,6 @@ from flowrec.verbs.session_parts import (
     declared_topics,
     digest_of,
     head_of,
-    means,
     raw_topics,
 )
 
@@ -144,7 +143,7 @@ class SessionComparison:
                 different[_NAMED:] = [f"{len(different) - _NAMED} more"]
             found = f"DIFFERENT in {', '.join(different)}" + (f"; {other}" if other else "")
         covered = self.covered
-        what = f"{_count_of(covered.topics, 'topic')} and {_count_of(covered.head, 'part')} of the head"
+        what = f"{_count_of(len(covered.topics), 'topic')} and {_count_of(len(covered.head), 'part')} of the head"
         return f"{covered.sentence(found)} ({what}{self.choice.text})"
 
     @property
@@ -205,8 +204,8 @@ def _names(first: Session, second: Session) -> tuple[str, str]:
     return str(first.path), str(second.path)
 
 
-def _count_of(names: Sequence[str], noun: str) -> str:
-    return f"{len(names)} {noun}{'s' * (len(names) != 1)}"
+def _count_of(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def _same_bytes(first: Session, second: Session) -> int | None:
@@ -282,27 +281,23 @@ def _compare_ticks(
     found: SessionComparison, sessions: tuple[Session, Session], progress: Callable[[float], None]
 ) -> None:
     """Compare the messages tick by tick; a topic or a field that one file does not have is told once."""
-    counts = [session.reader.counts for session in sessions]
-    fields_of = [session.reader.recorded_fields for session in sessions]
     left_out, compared = set(), []
     topics = found.choice.topics.topics
     for topic in topics:
-        there = [bool(each.get(topic.field)) for each in counts]
-        if not found.choice(topic.path) or not all(there):
+        counts = [each.reader.counts.get(topic.field, 0) for each in sessions]
+        if not found.choice(topic.path) or not any(counts):
             left_out.add(topic.path)
-        if not found.choice(topic.path) or not any(there):
             continue
         compared.append(topic.path)
-        if not all(there):
-            number = counts[not there[0]].get(topic.field, 0)
-            holder = found.names[not there[0]]
-            found.apart[topic.path] = f"only in {holder}, {number} message{'s' * (number != 1)}"
+        if not all(counts):
+            left_out.add(topic.path)
+            holder = found.names[not counts[0]]
+            found.apart[topic.path] = f"only in {holder}, {_count_of(sum(counts), 'message')}"
             continue
-        known = [fields_of[side].get(topic.field, frozenset()) for side in (0, 1)]
-        for side in (0, 1):
-            lone = sorted(known[side] - known[1 - side])
+        was, now = (each.reader.recorded_fields.get(topic.field, frozenset()) for each in sessions)
+        for holder, lone in zip(found.names, (was - now, now - was), strict=True):
             if lone:
-                found.apart[topic.path] = f"{', '.join(lone)}: only in {found.names[side]}"
+                found.apart[topic.path] = f"{', '.join(sorted(lone))}: only in {holder}"
     found.topics = (*compared, *found.topics)
     sides = Side.of("first", sessions[0]), Side.of("second", sessions[1])
     found.comparison = comparison = Comparison(tuple(Role), sides, frozenset(left_out))
@@ -338,9 +333,7 @@ def _by_nature(found: SessionComparison) -> tuple[str, ...]:
     different = {part.name for part in found.head if part.differences}
     topics = [*(topic for topic, count in found.comparison.topics.items() if count.different), *found.apart]
     names = [
-        word
-        for word in _BY_NATURE
-        if word in different or any(means(word, topic, found.choice.topics) for topic in topics)
+        word for word in _BY_NATURE if word in different or any(found.choice.means(word, topic) for topic in topics)
     ]
     drawn = [topic for topic, (_, wrong, _) in found.raw.items() if wrong]
     if "start" in different and drawn:

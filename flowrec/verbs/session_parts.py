@@ -50,8 +50,17 @@ class Choice:
 
     def __call__(self, name: str) -> bool:
         """True if something of this name is compared."""
-        chosen = not self.only or any(means(pattern, name, self.topics) for pattern in self.only)
-        return chosen and not any(means(pattern, name, self.topics) for pattern in self.ignore)
+        chosen = not self.only or any(self.means(pattern, name) for pattern in self.only)
+        return chosen and not any(self.means(pattern, name) for pattern in self.ignore)
+
+    def means(self, pattern: str, name: str) -> bool:
+        """True if a pattern or a word for several means a topic or an item of the head."""
+        known, topic = self.topics.by_path, name.startswith("/")
+        if pattern in _ROLES:
+            return name in known and known[name].role is _ROLES[pattern]
+        if pattern in ("head", DRAWINGS):
+            return (topic and name not in known) if pattern == DRAWINGS else not topic
+        return fnmatchcase(name, pattern) or name.startswith(f"{pattern}{'/' if topic else '.'}")
 
     @property
     def text(self) -> str:
@@ -64,21 +73,11 @@ class Choice:
         for option, patterns in (("--only", self.only), ("--ignore", self.ignore)):
             for pattern in patterns:
                 known = (*names, *GROUPS, *HEAD)
-                if pattern in (*GROUPS, *HEAD) or any(means(pattern, name, self.topics) for name in names):
+                if pattern in (*GROUPS, *HEAD) or any(self.means(pattern, name) for name in names):
                     continue
                 near = difflib.get_close_matches(pattern, known, 3, 0.5)
                 meant = f"did you mean {' or '.join(near)}?" if near else f"words for several are {', '.join(GROUPS)}"
                 raise UsageError(f"{option} {pattern}: is no topic and no part of the head of the two; {meant}")
-
-
-def means(pattern: str, name: str, topics: TopicTable) -> bool:
-    """True if a pattern or a word for several means a topic or an item of the head."""
-    known, topic = topics.by_path, name.startswith("/")
-    if pattern in _ROLES:
-        return name in known and known[name].role is _ROLES[pattern]
-    if pattern in ("head", DRAWINGS):
-        return (topic and name not in known) if pattern == DRAWINGS else not topic
-    return fnmatchcase(name, pattern) or name.startswith(f"{pattern}{'/' if topic else '.'}")
 
 
 def head_of(session: Session) -> dict[str, Item]:
