@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import cv2
 
 from flowrec.core import ChipError, UsageError, __version__, say, table
-from flowrec.measure.images import Colours, Mask, with_curves
-from flowrec.measure.pictures import SourcePicture, png_of, read_picture
+from flowrec.measure.images import Colours, Mask, SourcePicture, png_of, read_picture, with_curves
 from flowrec.measure.proposal import check_outputs, write_outputs
 from flowrec.measure.segmentation import Segmentation, Shown, chip_mask, segment
 from flowrec.physics import (
@@ -42,8 +41,7 @@ _SHOWN = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PictureChip:
+class PictureChip(NamedTuple):
     """A chip of a picture.
 
     Attributes

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowrec.core import ChipError, Image, UsageError, __version__, say, table
+from flowrec.measure.images import SourcePicture, png_of, read_picture
 from flowrec.measure.picture_registration import fit_nearby, moved_px, other_scale, overlay, register
-from flowrec.measure.pictures import SourcePicture, png_of, read_picture
 from flowrec.measure.proposal import as_toml, check_outputs, write_outputs
 from flowrec.measure.wall_fit import WallFit
 from flowrec.physics import Calibration, Chip, chip_key, compute_cached, load_chip
@@ -25,8 +24,7 @@ _ADVICE = "flowrec calibrate image PICTURE -o registration.toml measures it"
 _MOVED_PX = 1.0  # of the walls; a hundred times the error of a fit to good pictures, ten times that to poor ones
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ImageRegistration:
+class ImageRegistration(NamedTuple):
     """Poses that explain a picture equally well, and the one that was chosen, if any."""
 
     picture: SourcePicture
@@ -187,8 +185,7 @@ def registration_state(camera: CameraSettings, now: datetime | None = None) -> t
     return True, text
 
 
-@dataclass(frozen=True, slots=True)
-class WallsState:
+class WallsState(NamedTuple):
     """Comparison of the walls in an image with a registration: True where they agree, and one line on it.
 
     `other_scale` : they contradict its scale.

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +31,7 @@ _SPARSE, _EVEN, _LEAST_SAMPLES = 2.0, 3.0, 10
 _POOR_OFFSET_S = 0.01  # larger errors cost the refined flow about a percent
 
 
-@dataclass(frozen=True, slots=True)
-class MotionCalibration:
+class MotionCalibration(NamedTuple):
     """The fit of a session, and the settings that it proposes."""
 
     fit: MotionFit
@@ -176,7 +174,7 @@ def fit_samples(
     error_s = row_s / math.sqrt(12.0)
     fit = fit_log(stamps_ns, positions_um, log.interpolate(), within, flow, window=window, log_error_s=error_s)
     if not fit.refusal and fit.explained < LEAST_EXPLAINED_WITH_RATE:
-        fit = replace(fit, refusal=refusal_of(fit, LEAST_EXPLAINED_WITH_RATE))
+        fit = fit._replace(refusal=refusal_of(fit, LEAST_EXPLAINED_WITH_RATE))
     return fit
 
 

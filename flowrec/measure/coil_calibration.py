@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
@@ -26,8 +26,7 @@ _NOMINAL_MT = 4.0
 _DIRECTIONS = 400  # in which the uncertainty is evaluated
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Excitations:
+class Excitations(NamedTuple):
     """Rows of the file. Axes are those of the chip: x and y as in the image, z up from the floor."""
 
     currents_a: Floats  # (n, 3)
@@ -107,8 +106,7 @@ def _number(name: str, cell: str, where: str) -> float:
     return value
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoilFit:
+class CoilFit(NamedTuple):
     """B = A i + b with uncertainties; arrays by axis of the field (rows) and coil (columns), both x, y, z."""
 
     excitations: Excitations

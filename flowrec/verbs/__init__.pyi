@@ -14,7 +14,7 @@ from .preparation import prepare as prepare, refuse_adrift as refuse_adrift
 from .replay_change import Change as Change, FIXED as FIXED
 from .replay_made import refly as refly
 from .replay_result import refinement_remarks as refinement_remarks
-from .report_page import HTML as HTML, require_packages as require_packages
+from .report import HTML as HTML, require_packages as require_packages
 from .session_replay import replay_session as replay_session
 from .session_table import (
     AS_LIST as AS_LIST, SessionTable as SessionTable, SqlError as SqlError, connect as connect,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,8 +43,7 @@ _SIDE_PX = 1200  # of the picture of candidates, about
 _AMBER, _BLACK = (38, 140, 255), (0, 0, 0)  # blue, green, red
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MovieTracks:
+class MovieTracks(NamedTuple):
     """Track of the robot in the images of a movie, before anything is recorded.
 
     Attributes
@@ -126,7 +125,7 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
         asked, facts = _with_mean_shift(asked, shifts_px)
         if tracks is not None:  # as they are with the shift of the first image that was found
             by_um = p.calibration.to_um(first_px) - p.calibration.to_um(asked.stabilise.first_px)
-            tracks = replace(tracks, positions_um=tracks.positions_um + by_um)
+            tracks = tracks._replace(positions_um=tracks.positions_um + by_um)
     return Looked(asked, facts, prepared, tracks)
 
 

@@ -1,12 +1,14 @@
-"""Report of a session and of its replays, as one HTML page and as figures for a paper: flowrec report."""
+"""Report of a session and of its replays, as one HTML page and as figures for a paper: flowrec report.
+
+Needs the packages of the extra `report`: see `require_packages`.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flowrec.core import (
     DOUBTS,
@@ -23,6 +25,30 @@ from flowrec.core import (
     say,
     text_of_figure,
 )
+from flowrec.exports import (
+    GLOSSARY,
+    MEANINGS,
+    ChangeFigure,
+    Folded,
+    MapFigure,
+    MotionFigure,
+    ObserverFigure,
+    Page,
+    PathFigure,
+    PathFlowFigure,
+    RecordingFigure,
+    ReplayPart,
+    ReportData,
+    ReportFigure,
+    ReportTable,
+    Span,
+    TimelineFigure,
+    draw_figure,
+    numbered_actions,
+    render,
+    sentence,
+    style,
+)
 from flowrec.run import ReplayFiles, before_after
 from flowrec.stages import flow_error
 from flowrec.store import Session, files_behind, input_blamed, named_beside, session_sha256, toml_table
@@ -30,14 +56,10 @@ from flowrec.verbs.check import check
 from flowrec.verbs.info import facts_for_people, info
 from flowrec.verbs.replay_change import OF_EVERY_REPLAY
 from flowrec.verbs.replay_result import refinement_remarks
+from flowrec.verbs.report import HTML
 from flowrec.verbs.session_parts import flat
 from flowrec.verbs.verdict import Verdict
 
-if TYPE_CHECKING:
-    from flowrec.exports import Page, ReplayPart, ReportData, ReportFigure, ReportTable
-
-HTML = (".html", ".htm")
-_PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
 _HIDDEN = frozenset(  # of the outcome: shown elsewhere
     {
         "outcome",
@@ -66,9 +88,6 @@ def write_report(
     overwrite: bool,
 ) -> Path:
     """Write the report of a session; arguments and errors as of `flowrec.report`."""
-    require_packages()
-    from flowrec.exports import ReportData, render, style
-
     session = Session.of(session)
     parts = [Session.of(each) for each in replays]
     path = session.path
@@ -107,13 +126,6 @@ def write_report(
     return output.path
 
 
-def require_packages() -> None:
-    """Raise UsageError where a package of the extra `report` is not installed."""
-    for module, package in _PACKAGES.items():
-        if importlib.util.find_spec(module) is None:
-            raise UsageError(f"a report needs {package}, which is not installed: pip install 'flowrec[report]'")
-
-
 def _check_parents(session: Session, replays: Sequence[Session]) -> None:
     """Refuse a file that is no replay of this session."""
     sha256 = session_sha256([file.path for file in session.run.files]) if replays else ""
@@ -128,18 +140,6 @@ def _check_parents(session: Session, replays: Sequence[Session]) -> None:
 
 
 def _figures(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles]) -> list[ReportFigure]:
-    from flowrec.exports import (
-        ChangeFigure,
-        MapFigure,
-        MotionFigure,
-        ObserverFigure,
-        PathFigure,
-        PathFlowFigure,
-        RecordingFigure,
-        Span,
-        TimelineFigure,
-    )
-
     first_s = data.history.first_s
     gaps = [Span("no image", first_s + gap.at_s, first_s + gap.at_s + gap.length_s) for gap in verdict.gaps]
     changes = [ChangeFigure(pair.recorded.field, pair.replayed.field, n) for n, pair in enumerate(pairs, 1)]
@@ -157,8 +157,6 @@ def _figures(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles]) -
 
 def _files(kinds: Sequence[ReportFigure], data: ReportData) -> Iterator[tuple[str, bytes]]:
     """Name and content of each figure's files."""
-    from flowrec.exports import style
-
     for kind in kinds:
         if kind.why_not(data):
             continue
@@ -170,8 +168,6 @@ def _files(kinds: Sequence[ReportFigure], data: ReportData) -> Iterator[tuple[st
 
 
 def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: Sequence[ReportFigure]) -> Page:
-    from flowrec.exports import GLOSSARY, Folded, Page, ReportTable, draw_figure, sentence
-
     session = data.session
     facts = info(session)
     outcome = str(facts["outcome"])
@@ -235,8 +231,6 @@ def _maps(data: ReportData) -> dict[str, FlowField]:
 
 
 def _key_figures(data: ReportData) -> ReportTable:
-    from flowrec.exports import MEANINGS, ReportTable
-
     session = data.session
     figures = {"duration_s": session.duration_s} | {
         key: value for key, value in session.outcome.items() if key not in _HIDDEN and value not in (None, "")
@@ -262,8 +256,6 @@ def _micro(text: str) -> str:
 
 def _boundary(data: ReportData) -> ReportTable | None:
     """Inflow and pressure at the openings of the chip, before and after."""
-    from flowrec.exports import ReportTable
-
     fields = _maps(data) | ({"true": data.truth} if data.truth is not None else {})
     openings = data.scene.chip.openings
     if any(len(field.boundary_values) != len(openings) for field in fields.values()) or not fields:
@@ -295,8 +287,6 @@ def _refinement(data: ReportData) -> list[str]:
 
 
 def _events(data: ReportData) -> list[ReportTable]:
-    from flowrec.exports import ReportTable, numbered_actions
-
     history = data.history
     actions = [
         (number, f"{each.time_s:.2f} s", each.action, each.text) for number, each in numbered_actions(history.remarks)
@@ -331,8 +321,6 @@ def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]
 
 
 def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
-    from flowrec.exports import MEANINGS, ReplayPart, ReportTable
-
     # The error that the best map states for itself.
     was, now = (tick.field.error_share if tick.field is not None else None for tick in (pair.recorded, pair.replayed))
     stated: Row = ("stated_flow_error", was, now)

@@ -7,7 +7,7 @@ ran; that is told as every other difference is, with the option that leaves it o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from heapq import merge
@@ -23,11 +23,9 @@ from flowrec.verbs.session_parts import (
     Choice,
     PartOfHead,
     RawTopic,
+    SessionParts,
     at_text,
     compared_heads,
-    declared_topics,
-    digest_of,
-    head_of,
     raw_topics,
 )
 
@@ -38,6 +36,7 @@ _LONG = ("schema", "declaration")  # of a channel: only named where they differ
 _NAMED = 6  # topics and parts of the head that the verdict names
 
 
+Sessions = tuple[Session, Session]
 Raws = tuple[Mapping[str, RawTopic], Mapping[str, RawTopic]]  # of both sessions, by topic
 
 
@@ -171,9 +170,7 @@ class SessionComparison:
         }
 
 
-def compare_sessions(
-    sessions: tuple[Session, Session], choice: Choice, progress: Callable[[float], None]
-) -> SessionComparison:
+def compare_sessions(sessions: Sessions, choice: Choice, progress: Callable[[float], None]) -> SessionComparison:
     """Compare two sessions; parameters and errors as of `flowrec.compare`."""
     names = _names(*sessions)
     found = SessionComparison(names, choice, max(each.reader.counts.get("applied", 0) for each in sessions))
@@ -182,13 +179,16 @@ def compare_sessions(
         if found.bytes_alike is not None:
             found.topics = tuple(sessions[0].topics)
             return found
-        _compare_heads(found, sessions)
+        parts = SessionParts.of(sessions[0]), SessionParts.of(sessions[1])
+        choice.check([name for part in parts for name in (*part.head, *part.declared)])
+        found.head = compared_heads([part.head for part in parts], names, choice)
         raw = raw_topics(sessions[0], choice), raw_topics(sessions[1], choice)
         _compare_raw(found, raw)
         _compare_ticks(found, sessions, progress)
-        _compare_declared(found, sessions)
+        _compare_declared(found, [part.declared for part in parts])
         _compare_unread(found, sessions, raw)
-        _compare_digests(found, sessions)
+        if found.identical and not choice.text and not any(session.run.in_parts for session in sessions):
+            _compare_digests(found, [part.digest for part in parts])
     except KeyboardInterrupt as error:
         found.ended = Ended.of(error)
         found.ended.result = found
@@ -223,12 +223,6 @@ def _same_bytes(first: Session, second: Session) -> int | None:
     return sum(sizes[0])
 
 
-def _compare_heads(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
-    heads = [head_of(session) for session in sessions]
-    found.choice.check([*heads[0], *heads[1], *(name for each in sessions for name in declared_topics(each))])
-    found.head = compared_heads(heads, found.names, found.choice)
-
-
 def _compare_raw(found: SessionComparison, raw: Raws) -> None:
     """Compare the topics that are no field of `Tick`."""
     known = found.choice.topics.by_path
@@ -242,9 +236,9 @@ def _compare_raw(found: SessionComparison, raw: Raws) -> None:
     found.topics = tuple(dict.fromkeys((*was, *now)))
 
 
-def _compare_declared(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+def _compare_declared(found: SessionComparison, declared: Sequence[Mapping[str, Mapping[str, str]]]) -> None:
     """Compare what the topics declare that both hold: encoding, depth, region, role, and the schema."""
-    was, now = (declared_topics(session) for session in sessions)
+    was, now = declared
     for topic in found.topics:
         if topic not in was or topic not in now or topic in found.apart:
             continue
@@ -254,7 +248,7 @@ def _compare_declared(found: SessionComparison, sessions: tuple[Session, Session
             found.apart[topic] = f"declared otherwise: {'; '.join(texts) or f'another {keys[0]}'}"
 
 
-def _compare_unread(found: SessionComparison, sessions: tuple[Session, Session], raw: Raws) -> None:
+def _compare_unread(found: SessionComparison, sessions: Sessions, raw: Raws) -> None:
     """Messages that are the same in all that flowrec reads, and not in the file: fields of foxglove's schemas."""
     if sessions[0].header.start_unix_ns != sessions[1].header.start_unix_ns:
         return  # the wall clock is in them
@@ -266,20 +260,16 @@ def _compare_unread(found: SessionComparison, sessions: tuple[Session, Session],
                 found.apart[topic] = f"{wrong} differ in what flowrec does not read{at_text(stamp_ns)}"
 
 
-def _compare_digests(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+def _compare_digests(found: SessionComparison, digests: Sequence[Mapping[str, str] | None]) -> None:
     """Two digests that differ although all is the same: of numbers and order of messages, which no reader returns."""
-    if not found.identical or found.choice.text or any(session.run.in_parts for session in sessions):
-        return
-    was, now = (digest_of(session) for session in sessions)
+    was, now = digests
     if was is not None and now is not None and was != now:
         topics = [key for key in {**was, **now} if was.get(key) != now.get(key)]
         told = {"": f"states others for {', '.join(topics)}: the numbers of the messages differ"}
         found.head.append(PartOfHead("digest", 1, told))
 
 
-def _compare_ticks(
-    found: SessionComparison, sessions: tuple[Session, Session], progress: Callable[[float], None]
-) -> None:
+def _compare_ticks(found: SessionComparison, sessions: Sessions, progress: Callable[[float], None]) -> None:
     """Compare the messages tick by tick; a topic or a field that one file does not have is told once."""
     left_out, compared = set(), []
     topics = found.choice.topics.topics
@@ -310,9 +300,7 @@ def _compare_ticks(
         progress(seconds(stamp_ns - first_ns))
 
 
-def _compare_paired_ticks(
-    comparison: Comparison, sessions: tuple[Session, Session], *, with_frames: bool
-) -> Iterator[int]:
+def _compare_paired_ticks(comparison: Comparison, sessions: Sessions, *, with_frames: bool) -> Iterator[int]:
     """Compare tick by tick; yields the stamp of each in ns."""
     ticks = [zip(each.ticks(with_frames=with_frames), repeat(side)) for side, each in enumerate(sessions)]
 

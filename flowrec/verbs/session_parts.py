@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowrec.core import FIXED, Role, TopicTable, UsageError, printable, seconds
 from flowrec.store import FRAME_PATH, Session, SessionHeader, SessionMetadata, is_header_file, toml_table
@@ -80,26 +80,45 @@ class Choice:
                 raise UsageError(f"{option} {pattern}: is no topic and no part of the head of the two; {meant}")
 
 
-def head_of(session: Session) -> dict[str, Item]:
-    """All of a session's head by name: settings, chip, origin, outcome, and the records of other programs."""
-    items: dict[str, Item] = {}
-    with SessionMetadata(session.run.files[0].path) as first:
-        header = first.header
-        items |= _of_header(header, str(session.path))
-        items |= {f"outcome.{key}": text for key, text in session.run.outcome.items()}
-        if session.run.part is not None:
-            part = session.run.part
-            items["part"] = f"{part.kind} {part.number}"
-        if first.digest is not None:
-            items["digest"] = "there"
-        for record in first.metadata:
-            if not record.name.startswith(_OWN):
-                content = first.source.metadata(record)
-                items |= {f"records.{record.name}.{key}": text for key, text in content.items()}
-        for place in first.attachments:
-            if not is_header_file(place.name):
-                items[f"records.{place.name}"] = first.source.attachment(place)
-    return items
+class SessionParts(NamedTuple):
+    """A session without the messages of its ticks.
+
+    Attributes
+    ----------
+    head : settings, chip, origin, outcome, and the records of other programs, by name.
+    declared : declarations of the channels, by topic: the metadata, and a hash of the schema.
+    digest : of the first file, by topic; None without one.
+    """
+
+    head: dict[str, Item]
+    declared: dict[str, dict[str, str]]
+    digest: dict[str, str] | None
+
+    @classmethod
+    def of(cls, session: Session) -> SessionParts:
+        """Read those of a session; of a run in several files the first one states them."""
+        with SessionMetadata(session.run.files[0].path) as first:
+            items = dict(_of_header(first.header, str(session.path)))
+            items |= {f"outcome.{key}": text for key, text in session.run.outcome.items()}
+            if session.run.part is not None:
+                part = session.run.part
+                items["part"] = f"{part.kind} {part.number}"
+            if first.digest is not None:
+                items["digest"] = "there"
+            for record in first.metadata:
+                if not record.name.startswith(_OWN):
+                    content = first.source.metadata(record)
+                    items |= {f"records.{record.name}.{key}": text for key, text in content.items()}
+            for place in first.attachments:
+                if not is_header_file(place.name):
+                    items[f"records.{place.name}"] = first.source.attachment(place)
+            declared = {}
+            for channel in first.channels.values():
+                schema = first.schemas.get(channel.schema_id)
+                text = f"{schema.name} {schema.encoding} ".encode() + schema.data if schema is not None else b""
+                hashed = hashlib.blake2b(text, digest_size=8).hexdigest()
+                declared[channel.topic] = {**channel.metadata, "schema": hashed}
+            return cls(items, declared, first.digest)
 
 
 def _of_header(header: SessionHeader, path: str) -> Iterator[tuple[str, Item]]:
@@ -126,8 +145,7 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]
             yield f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-@dataclass(frozen=True, slots=True)
-class PartOfHead:
+class PartOfHead(NamedTuple):
     """Comparison of one part of two heads.
 
     Attributes
@@ -230,23 +248,6 @@ def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, Raw
                         assert isinstance(record.payload, memoryview)
                         found.setdefault(wanted[record.channel], RawTopic()).add(record.log_ns, bytes(record.payload))
     return found
-
-
-def declared_topics(session: Session) -> dict[str, dict[str, str]]:
-    """Declarations of the channels of a session, by topic: the metadata, and a hash of the schema."""
-    found: dict[str, dict[str, str]] = {}
-    with SessionMetadata(session.run.files[0].path) as opened:
-        for channel in opened.channels.values():
-            schema = opened.schemas.get(channel.schema_id)
-            text = f"{schema.name} {schema.encoding} ".encode() + schema.data if schema is not None else b""
-            found[channel.topic] = {**channel.metadata, "schema": hashlib.blake2b(text, digest_size=8).hexdigest()}
-    return found
-
-
-def digest_of(session: Session) -> dict[str, str] | None:
-    """Digest of a session in one file, by topic; None without one."""
-    with SessionMetadata(session.run.files[0].path) as opened:
-        return opened.digest
 
 
 def at_text(stamp_ns: int | None) -> str:
