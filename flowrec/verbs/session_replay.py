@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -105,7 +105,11 @@ def replay_session(
         stack.enter_context(input_blamed(replay.session, replay.config, "replayed"))
         writer, judges, sinks = None, judges_of(replay.pipeline), list[Sink]()
         if out is not None:
-            writer = stack.enter_context(replay.writer_to(output))
+            session, config, topics = replay.session, replay.config, replay.pipeline.topics
+            facts = facts_of(config, session.provenance)
+            writer = stack.enter_context(
+                session_writer(output, config, session.chip, parent=session.path, facts=facts, topics=topics)
+            )
             sinks += [writer if frames else WithoutFrames(writer), *judges]
         replay.show_progress(stack)
         result = replay.run(sinks)
@@ -171,17 +175,6 @@ class _Replay:
             self._stale,
             lambda: rig.recorded,
             change.same_orders(recorded, self.config) if stands else (),
-        )
-
-    def writer_to(self, output: Output) -> AbstractContextManager[SessionWriter]:
-        """Context of the session file of the replay."""
-        return session_writer(
-            output,
-            self.config,
-            self.session.chip,
-            parent=self.session.path,
-            facts=facts_of(self.config, self.session.provenance),
-            topics=self.pipeline.topics,
         )
 
     def show_progress(self, stack: ExitStack) -> None:
