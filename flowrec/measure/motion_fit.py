@@ -88,11 +88,6 @@ class MotionFit(NamedTuple):
     frames: int  # that were used
     left_out: int  # frames with a position that the robot can not have reached
 
-    @property
-    def accepted(self) -> bool:
-        """True if the fit may be used."""
-        return not self.refusal
-
 
 def fit_motion(
     stamps_s: ArrayLike,

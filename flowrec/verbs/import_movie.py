@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flowrec.verbs.command import Told, verb
-from flowrec.verbs.options import ATTENDED, AsConfig, Asked, Overwrite, Sets, readable_toml
+from flowrec.verbs.options import ATTENDED, AsConfig, Asked, Overwrite, SessionOut, Sets, readable_toml
 from flowrec.verbs.record import config_of_call
 
 if TYPE_CHECKING:
@@ -30,9 +30,7 @@ def import_movie(
         Path | str,
         typer.Argument(help="Movie: AVI, MP4, MKV, MOV, TIFF, ND2, OME-Zarr, or a folder of images."),
     ],
-    out: Annotated[
-        Path | str | None, typer.Option("--out", "-o", help="Session file; by default named by date and sample.")
-    ] = None,
+    out: SessionOut = None,
     config: Annotated[AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML).")] = None,
     *,
     coils: Annotated[

@@ -38,6 +38,9 @@ SessionFile = Annotated[
 _SET = typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb.")
 Sets = Annotated[list[str] | Mapping[str, Any] | None, _SET]
 SetTexts = Annotated[list[str] | None, _SET]
+SessionOut = Annotated[
+    Path | str | None, typer.Option("--out", "-o", help="Session file; by default named by date and sample.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 

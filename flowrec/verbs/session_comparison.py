@@ -24,7 +24,6 @@ from flowrec.verbs.session_parts import (
     PartOfHead,
     RawTopic,
     SessionParts,
-    at_text,
     compared_heads,
     raw_topics,
 )
@@ -231,8 +230,8 @@ def _compare_raw(found: SessionComparison, raw: Raws) -> None:
         if topic not in was or topic not in now:
             found.apart[topic] = f"only in {found.names[topic not in was]}"
             continue
-        same, wrong, stamp_ns = was[topic].same_as(now[topic])
-        found.raw[topic] = (same, wrong, f", {wrong} DIFFERENT{at_text(stamp_ns)}" if wrong else "")
+        same, wrong, where = was[topic].same_as(now[topic])
+        found.raw[topic] = (same, wrong, f", {wrong} DIFFERENT{where}" if wrong else "")
     found.topics = tuple(dict.fromkeys((*was, *now)))
 
 
@@ -255,9 +254,9 @@ def _compare_unread(found: SessionComparison, sessions: Sessions, raw: Raws) -> 
     for topic, count in found.comparison.topics.items():
         told = topic in found.apart or count.different or count.within_tolerance
         if not told and topic in raw[0] and topic in raw[1]:
-            _, wrong, stamp_ns = raw[0][topic].same_as(raw[1][topic])
+            _, wrong, where = raw[0][topic].same_as(raw[1][topic])
             if wrong:
-                found.apart[topic] = f"{wrong} differ in what flowrec does not read{at_text(stamp_ns)}"
+                found.apart[topic] = f"{wrong} differ in what flowrec does not read{where}"
 
 
 def _compare_digests(found: SessionComparison, digests: Sequence[Mapping[str, str] | None]) -> None:

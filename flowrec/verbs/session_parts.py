@@ -216,15 +216,15 @@ class RawTopic:
         self.log_ns.append(log_ns)
         self.hashes.append(int.from_bytes(hashlib.blake2b(payload, digest_size=8).digest(), "little"))
 
-    def same_as(self, other: RawTopic) -> tuple[int, int, int | None]:
-        """Messages that are the same and that differ, and the stamp in ns of the first that differs."""
+    def same_as(self, other: RawTopic) -> tuple[int, int, str]:
+        """Messages that are the same and that differ, and as text when the first does."""
         count = max(len(self.log_ns), len(other.log_ns))
         if self.log_ns == other.log_ns and self.hashes == other.hashes:
-            return count, 0, None
+            return count, 0, ""
         here, there = (Counter(zip(each.log_ns, each.hashes, strict=True)) for each in (self, other))
         same = (here & there).total()
         apart = [stamp_ns for stamp_ns, _ in ((here - there) + (there - here))]
-        return same, count - same, min(apart, default=None)
+        return same, count - same, f", the first at {seconds(min(apart)):.3f} s" if apart else ""
 
 
 def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, RawTopic]:
@@ -248,8 +248,3 @@ def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, Raw
                         assert isinstance(record.payload, memoryview)
                         found.setdefault(wanted[record.channel], RawTopic()).add(record.log_ns, bytes(record.payload))
     return found
-
-
-def at_text(stamp_ns: int | None) -> str:
-    """Place of the first difference, as text."""
-    return "" if stamp_ns is None else f", the first at {seconds(stamp_ns):.3f} s"
