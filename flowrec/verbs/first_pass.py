@@ -109,13 +109,12 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
     if robot and marked:
         raise UsageError(f"--robot {robot}: tracker.click_px or box_px is set too; give one of them")
     prepared = prepare(looked_at, aloud=False)  # the import says it, of the settings that are used
-    place_px = _place_of(robot, asked, prepared.pipeline)
+    p, movie = prepared.pipeline, looked_at.movie
+    place_px = _place_of(robot, asked, p)
     if place_px is not None:
         asked = replace(asked, tracker=replace(asked.tracker, click_px=place_px))
-    p, movie = prepared.pipeline, looked_at.movie
-    if place_px is None and not marked:
-        seen = _first_seen(p, movie, prepared)
-        asked = _with_chosen_body(asked, p, *seen, robot, folder) if seen is not None else asked
+    elif not marked and (seen := _first_seen(p, movie, prepared)) is not None:
+        asked = _with_chosen_body(asked, p, *seen, robot, folder)
     click = asked.tracker
     p = replace(p, tracker=replace(p.tracker, click_px=click.click_px, click_frame=click.click_frame))
     shifts_px, tracks = _look_through(p, movie, prepared)

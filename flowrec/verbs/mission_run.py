@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flowrec.console import RunEnded, refuse_without_packages
 from flowrec.core import (
@@ -50,7 +51,6 @@ from flowrec.stages import (
 )
 from flowrec.store import SessionWriter, session_writer
 from flowrec.verbs.admission import admit, rehearse_aloud
-from flowrec.verbs.first_pass import Looked
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.preparation import (
     Prepared,
@@ -63,6 +63,9 @@ from flowrec.verbs.preparation import (
 )
 from flowrec.verbs.run_summary import GOOD_ENDS, Recorded, figures_of, files_text, judge_refinement, judges_of
 from flowrec.verbs.watching import Watching
+
+if TYPE_CHECKING:
+    from flowrec.verbs.first_pass import Looked
 
 # Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
 CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
