@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Coverage, Currents, FlowField, UsageError, __version__, say, seconds, table
+from flowrec.core import NS_PER_S, Coverage, Currents, FlowField, Ints, UsageError, __version__, say, seconds, table
 from flowrec.measure.motion_fit import LEAST_EXPLAINED_WITH_RATE, LEAST_FRAMES, MotionFit, fit_motion, refusal_of
 from flowrec.measure.motion_regression import Turns
 from flowrec.measure.motion_search import SearchRange
@@ -18,7 +17,6 @@ from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outp
 from flowrec.stages import MOVIE, FieldCommand, FieldLog, FieldState, Floats, field_motion, read_coil_log
 from flowrec.store import Session, files_behind
 
-Stamps = NDArray[np.int64]
 # A log on another clock: any offset, and rates of 30 % to either side.
 ANYWHERE = SearchRange(least_rate=0.7, largest_rate=1.0 / 0.7)
 _ONE_CLOCK = SearchRange(-2.0, 2.0)  # from command to motion
@@ -112,7 +110,7 @@ def calibrate_motion(
 
 
 def fit_log(
-    stamps_ns: Stamps,
+    stamps_ns: Ints,
     positions_um: Floats,
     log: FieldLog,
     within: SearchRange,
@@ -155,7 +153,7 @@ def sampled_s(log: FieldLog, image_s: float) -> float | None:
 
 
 def fit_samples(
-    stamps_ns: Stamps,
+    stamps_ns: Ints,
     positions_um: Floats,
     log: FieldLog,
     within: SearchRange,
@@ -178,7 +176,7 @@ def fit_samples(
     return fit
 
 
-def _means(stamps_ns: Stamps, positions_um: Floats, window: int) -> tuple[Stamps, Floats, Floats]:
+def _means(stamps_ns: Ints, positions_um: Floats, window: int) -> tuple[Ints, Floats, Floats]:
     """Mean stamps (m,) and positions (m, 2) of so many frames in turn, and when those are around the mean, in ns."""
     used = len(stamps_ns) // window * window
     stamps, places = stamps_ns[:used].reshape(-1, window), positions_um[:used].reshape(-1, window, 2)

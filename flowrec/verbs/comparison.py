@@ -14,6 +14,7 @@ from flowrec.core import (
     FIXED,
     NUMERICS_VERSION,
     TOPICS,
+    Floats,
     Message,
     Role,
     Source,
@@ -348,13 +349,13 @@ def _deviation(was: object, now: object, rtol: float, atol: float) -> _Deviation
     return math.inf, None, _form(was), _form(now)
 
 
-def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> NDArray[np.float64]:
+def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> Floats:
     """|was - now| / (atol + rtol |was|) per element; values that are not finite equal only the same value."""
     a, b = np.asarray(was, np.float64), np.asarray(now, np.float64)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))
         ratio = np.abs(a - b) / (atol + rtol * np.abs(a))
-    excess: NDArray[np.float64] = np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
+    excess: Floats = np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
     return excess
 
 

@@ -19,7 +19,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, PICTURE, Floats, Frame, Image, Output, Track, UsageError, say, seconds, shift_px
+from flowrec.core import (
+    NS_PER_S,
+    PICTURE,
+    Floats,
+    Frame,
+    Image,
+    Ints,
+    Output,
+    Track,
+    UsageError,
+    say,
+    seconds,
+    shift_px,
+)
 from flowrec.rigs import MovieSource
 from flowrec.stages import (
     MOST,
@@ -57,7 +70,7 @@ class MovieTracks(NamedTuple):
     doubts : about the track.
     """
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Ints
     positions_um: Floats
     log: FieldLog
     shake_px: float | None

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     ANSWERED_BY,
@@ -19,6 +18,7 @@ from flowrec.core import (
     NUMERICS_VERSION,
     WORKER_FIELDS,
     Applied,
+    Floats,
     Mission,
     Observations,
     Outcome,
@@ -377,7 +377,7 @@ def _closing_work(
     return tick if tick.refined is not last.refined or tick.route is not last.route else last
 
 
-def planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
+def planned_from(recorded: Tick, last: Tick) -> Floats:
     """The start of the recorded route, else the position of the robot: a point (2,) in um."""
     if recorded.route is not None and recorded.route.reachable and recorded.mission is not None:
         return np.array(recorded.route.waypoints_um[0], np.float64)
