@@ -55,7 +55,7 @@ class SessionComparison:
     raw : topics that are compared as they are in the file: messages that are the same, that differ, and text.
     topics : that were compared.
     by_nature : what differs between any two runs, and does here; as names for --ignore.
-    ended : what stopped it early.
+    stopped, status : what ended it early, and its exit status; '' if nothing did.
     """
 
     names: tuple[str, str]
@@ -68,7 +68,8 @@ class SessionComparison:
     raw: dict[str, tuple[int, int, str]] = field(default_factory=dict)
     topics: tuple[str, ...] = ()
     by_nature: tuple[str, ...] = ()
-    ended: Ended | None = None
+    stopped: str = ""
+    status: int = 0
 
     @property
     def covered(self) -> Coverage:
@@ -77,9 +78,9 @@ class SessionComparison:
             return Coverage(self.total, self.total, topics=self.topics, head=HEAD)
         done, head = self.comparison.ticks, tuple(dict.fromkeys(part.name for part in self.head))
         covered = Coverage(done, done, topics=self.topics, head=head)
-        if self.ended is None:
+        if not self.stopped:
             return covered
-        return replace(covered, total=max(done, self.total), stopped=self.ended.why, status=self.ended.status)
+        return replace(covered, total=max(done, self.total), stopped=self.stopped, status=self.status)
 
     @property
     def first(self) -> Difference | None:
@@ -94,7 +95,7 @@ class SessionComparison:
     @property
     def same(self) -> bool | None:
         """All that was asked for is the same within its tolerance; None if it was stopped before a difference."""
-        return None if self.ended is not None and self.same_so_far else self.same_so_far
+        return None if self.stopped and self.same_so_far else self.same_so_far
 
     @property
     def identical(self) -> bool | None:
@@ -104,7 +105,7 @@ class SessionComparison:
     @property
     def exit_status(self) -> int:
         """0 the same, 3 something differs, 130 or 143 stopped."""
-        return self.ended.status if self.ended is not None else 0 if self.same else 3
+        return self.status if self.stopped else 0 if self.same else 3
 
     def lines(self) -> list[str]:
         """A line for each topic and part of the head, hints, and the verdict."""
@@ -189,9 +190,9 @@ def compare_sessions(sessions: Sessions, choice: Choice, progress: Callable[[flo
         if found.identical and not choice.text and not any(session.run.in_parts for session in sessions):
             _compare_digests(found, [part.digest for part in parts])
     except KeyboardInterrupt as error:
-        found.ended = Ended.of(error)
-        found.ended.result = found
-        raise found.ended from error
+        ended = Ended.of(error)
+        found.stopped, found.status, ended.result = ended.why, ended.status, found
+        raise ended from error
     found.by_nature = _by_nature(found)
     return found
 
