@@ -72,11 +72,16 @@ class SessionComparison:
     status: int = 0
 
     @property
+    def ticks(self) -> int:
+        """Ticks that were compared."""
+        return self.comparison.ticks
+
+    @property
     def covered(self) -> Coverage:
         """The ticks, topics and parts of the head that were compared."""
         if self.bytes_alike is not None:
             return Coverage(self.total, self.total, topics=self.topics, head=HEAD)
-        done, head = self.comparison.ticks, tuple(dict.fromkeys(part.name for part in self.head))
+        done, head = self.ticks, tuple(dict.fromkeys(part.name for part in self.head))
         covered = Coverage(done, done, topics=self.topics, head=head)
         if not self.stopped:
             return covered
