@@ -41,11 +41,11 @@ from flowrec.stages import (
 )
 from flowrec.store import frames_of, image_bytes_s
 from flowrec.verbs.admission import rehearse, route_on_assumed_flow
-from flowrec.verbs.doctor import FAILURE, OK, WARNING
 from flowrec.verbs.preparation import refuse_adrift
 from flowrec.view import executable, has_display
 
 T = TypeVar("T")
+OK, WARNING, FAILURE = "ok", "warning", "failure"
 _SIGNS = {OK: " ", WARNING: "!", FAILURE: "x"}
 _OF_DEVICES = ("camera", "coils", "lab")  # sections
 _RATE_TOLERANCE = 0.05

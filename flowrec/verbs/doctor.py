@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from flowrec.stages import Config
     from flowrec.verbs.diagnosis import Finding
 
-OK, WARNING, FAILURE = "ok", "warning", "failure"
-
 
 class Diagnosis:
     """Iterator over findings, each as it is looked at; `findings` holds those so far."""
@@ -33,6 +31,8 @@ class Diagnosis:
     @property
     def level(self) -> str:
         """The worst of all findings."""
+        from flowrec.verbs.diagnosis import FAILURE, OK, WARNING
+
         self.findings += self._coming
         levels = {finding.level for finding in self.findings}
         return next((level for level in (FAILURE, WARNING) if level in levels), OK)
@@ -40,7 +40,7 @@ class Diagnosis:
     @property
     def exit_status(self) -> int:
         """1 if something has failed."""
-        return int(self.level == FAILURE)
+        return int(self.level == "failure")
 
     def as_json(self) -> dict[str, Any]:
         """For JSON."""

@@ -1,6 +1,5 @@
 """`flowrec report`: one page about a session and its replays, or about a sweep."""
 
-import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -9,17 +8,7 @@ import typer
 
 from flowrec.core import UsageError
 from flowrec.verbs.command import Told, verb
-from flowrec.verbs.options import AnySession, Asked, Overwrite, SessionFile, from_above
-
-HTML = (".html", ".htm")
-_PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
-
-
-def require_packages() -> None:
-    """Raise UsageError where a package of the extra `report` is not installed."""
-    for module, package in _PACKAGES.items():
-        if importlib.util.find_spec(module) is None:
-            raise UsageError(f"a report needs {package}, which is not installed: pip install 'flowrec[report]'")
+from flowrec.verbs.options import AnySession, Asked, Overwrite, SessionFile, from_above, require_packages
 
 
 def _report_told(asked: Asked, page: Path) -> Told:

@@ -54,9 +54,9 @@ from flowrec.stages import flow_error
 from flowrec.store import Session, files_behind, input_blamed, named_beside, session_sha256, toml_table
 from flowrec.verbs.check import check
 from flowrec.verbs.info import facts_for_people, info
+from flowrec.verbs.options import HTML
 from flowrec.verbs.replay_change import OF_EVERY_REPLAY
 from flowrec.verbs.replay_result import refinement_remarks
-from flowrec.verbs.report import HTML
 from flowrec.verbs.session_parts import flat
 from flowrec.verbs.verdict import Verdict
 
