@@ -15,7 +15,7 @@ from .verbs.info import info as info
 from .verbs.record import record as record
 from .verbs.replay import replay as replay
 from .verbs.replay_change import Change as Change
-from .verbs.replay_made import Replay as Replay
+from .verbs.replay_result import Replay as Replay
 from .verbs.report import report as report
 from .verbs.user_flow import refine as refine
 from .verbs.user_flow import solve as solve

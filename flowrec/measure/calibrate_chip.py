@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import cv2
 
 from flowrec.core import ChipError, UsageError, __version__, say, table
-from flowrec.measure.images import Colours, Mask, with_curves
-from flowrec.measure.pictures import SourcePicture, png_of, read_picture
+from flowrec.measure.images import Colours, Mask, SourcePicture, png_of, read_picture, with_curves
 from flowrec.measure.proposal import check_outputs, write_outputs
 from flowrec.measure.segmentation import Segmentation, Shown, chip_mask, segment
 from flowrec.physics import (
@@ -42,8 +41,7 @@ _SHOWN = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PictureChip:
+class PictureChip(NamedTuple):
     """A chip of a picture.
 
     Attributes
@@ -64,6 +62,7 @@ class PictureChip:
     inlets_known: bool
     speed_um_s: float | None
     wall_shift_um: float
+    out: Path | None  # the TOML file, if it was written
 
     @property
     def unit(self) -> str:
@@ -84,6 +83,39 @@ class PictureChip:
     def chip(self, name: str) -> Chip:
         """The chip with assumptions in place of what is not known."""
         return Chip(name, self.mask, self.pixel_size, self.openings, WATER_MPA_S, WATER_KG_M3)
+
+    def as_json(self) -> dict[str, Any]:
+        """The chip as plain numbers."""
+        openings = [
+            {"name": name, "side": o.side, "first": o.first, "last": o.last, "kind": kind}
+            for name, o, kind in self.named_openings
+        ]
+        return {
+            "walls": self.found.shown,
+            **{key: round(value, 4) for key, value in self.found.figures.items()},
+            "um_per_px": None if self.um_per_px is None else self.pixel_size,
+            "mask_px": [self.mask.shape[1], self.mask.shape[0]],
+            "fluid_share": round(float(self.mask.mean()), 4),
+            "openings": openings,
+            "remarks": remarks(self),
+            "covered": self.picture.covered.as_json(),
+        }
+
+    def show(self) -> None:
+        """Print the openings as a table, the verdict, the files, and what a person must do."""
+        rows = [
+            (name, f"{o.first}-{o.last}", f"{o.width_px * self.pixel_size:.4g}", kind or "?")
+            for name, o, kind in self.named_openings
+        ]
+        height, width = self.mask.shape
+        fluid = f"{100 * float(self.mask.mean()):.1f} % fluid"
+        title = f"Channel in {self.picture.source}: mask of {width} x {height} px, {fluid}"
+        table(title, ("opening", "pixels", f"width ({self.unit})", "kind"), rows)
+        say(verdict(self))
+        if (out := self.out) is not None:
+            say(f"{out}, {out.stem}.png (mask) and {out.stem}{_OVERLAY} written: look at the overlay, correct the mask")
+        for line in remarks(self):
+            say(line)
 
 
 def calibrate_chip(
@@ -145,7 +177,9 @@ def calibrate_chip(
     openings = name_inlets(openings, inlets, str(path)) if inlets else openings
     if inlet_speed_um_s is not None:
         openings = set_inlet_speed(openings, inlet_speed_um_s)
-    done = PictureChip(picture, found, mask, pixel, um_per_px, openings, bool(inlets), inlet_speed_um_s, wall_shift_um)
+    done = PictureChip(
+        picture, found, mask, pixel, um_per_px, openings, bool(inlets), inlet_speed_um_s, wall_shift_um, out
+    )
     check_chip(done.chip(path.stem), str(path))
     if out is not None:
         mask_png, _ = chip_files(done.chip(out.stem))
@@ -222,42 +256,6 @@ def remarks(done: PictureChip) -> list[str]:
     if done.speed_um_s is None:
         lines.append("Nor how fast the flow is: fill in speed_um_s, or give --inlet-speed UM_S")
     return lines
-
-
-def figures(done: PictureChip) -> dict[str, Any]:
-    """The chip as plain numbers."""
-    openings = [
-        {"name": name, "side": o.side, "first": o.first, "last": o.last, "kind": kind}
-        for name, o, kind in done.named_openings
-    ]
-    return {
-        "walls": done.found.shown,
-        **{key: round(value, 4) for key, value in done.found.figures.items()},
-        "um_per_px": None if done.um_per_px is None else done.pixel_size,
-        "mask_px": [done.mask.shape[1], done.mask.shape[0]],
-        "fluid_share": round(float(done.mask.mean()), 4),
-        "openings": openings,
-        "remarks": remarks(done),
-        "covered": done.picture.covered.as_json(),
-    }
-
-
-def show(done: PictureChip, out: Path | None) -> None:
-    """Print the openings as a table, the verdict, the files, and what a person must do."""
-    rows = [
-        (name, f"{o.first}-{o.last}", f"{o.width_px * done.pixel_size:.4g}", kind or "?")
-        for name, o, kind in done.named_openings
-    ]
-    height, width = done.mask.shape
-    title = (
-        f"Channel in {done.picture.source}: mask of {width} x {height} px, {100 * float(done.mask.mean()):.1f} % fluid"
-    )
-    table(title, ("opening", "pixels", f"width ({done.unit})", "kind"), rows)
-    say(verdict(done))
-    if out is not None:
-        say(f"{out}, {out.stem}.png (mask) and {out.stem}{_OVERLAY} written: look at the overlay, correct the mask")
-    for line in remarks(done):
-        say(line)
 
 
 def _point(text: str) -> tuple[float, float]:

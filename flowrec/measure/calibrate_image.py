@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowrec.core import ChipError, Image, UsageError, __version__, say, table
+from flowrec.measure.images import SourcePicture, png_of, read_picture
 from flowrec.measure.picture_registration import fit_nearby, moved_px, other_scale, overlay, register
-from flowrec.measure.pictures import SourcePicture, png_of, read_picture
 from flowrec.measure.proposal import as_toml, check_outputs, write_outputs
 from flowrec.measure.wall_fit import WallFit
 from flowrec.physics import Calibration, Chip, chip_key, compute_cached, load_chip
@@ -25,8 +24,7 @@ _ADVICE = "flowrec calibrate image PICTURE -o registration.toml measures it"
 _MOVED_PX = 1.0  # of the walls; a hundred times the error of a fit to good pictures, ten times that to poor ones
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ImageRegistration:
+class ImageRegistration(NamedTuple):
     """Poses that explain a picture equally well, and the one that was chosen, if any."""
 
     picture: SourcePicture
@@ -34,6 +32,59 @@ class ImageRegistration:
     poses: tuple[WallFit, ...]
     chosen: WallFit | None
     registered_on: str
+    out: Path | None  # that the settings of the chosen one were written to
+
+    @property
+    def exit_status(self) -> int:
+        """1 if none was chosen."""
+        return int(self.chosen is None)
+
+    def as_json(self) -> dict[str, Any]:
+        """The poses as plain numbers."""
+        poses = []
+        for fit in self.poses:
+            x, y, angle, scale = fit.std.tolist()
+            quality = {
+                "walls_found": round(fit.found, 4),
+                "walls_seen": round(fit.seen, 4),
+                "explained": round(fit.explained, 4),
+                "standard_error_um": [x, y],
+                "standard_error_deg": angle,
+                "standard_error_scale": scale,
+            }
+            poses.append(settings_of(self, fit) | quality)
+        chosen = next((n for n, fit in enumerate(self.poses) if fit is self.chosen), None)
+        return {"chip": self.chip.name, "poses": poses, "chosen": chosen, "covered": self.picture.covered.as_json()}
+
+    def show(self) -> None:
+        """Print the poses as a table.
+
+        Raises ChipError, in one line, if several are equally good and none was chosen.
+        """
+        rows = []
+        for number, fit in enumerate(self.poses, 1):
+            settings, (x, y, angle, scale) = settings_of(self, fit), fit.std.tolist()
+            rows.append(
+                (
+                    str(number),
+                    f"{settings['um_per_px']:.5g} ± {100 * scale:.1g} %",
+                    f"{settings['angle_deg']:.3f} ± {angle:.1g}",
+                    "yes" if settings["mirror"] else "no",
+                    f"{settings['centre_um'][0]:.1f}, {settings['centre_um'][1]:.1f} ± {max(x, y):.1g}",
+                    f"{fit.residual_um:.2g}",
+                    f"{100 * fit.found:.0f} %",
+                )
+            )
+        columns = ("", "um per px", "angle (deg)", "mirror", "image centre (um)", "residual (um)", "walls found")
+        table(f"{self.chip.name} in {self.picture.source}", columns, rows)
+        if self.chosen is None:
+            raise ChipError(
+                f"{self.picture.source}: the chip {self.chip.name} looks the same in {len(self.poses)} ways; choose "
+                "one of the table with --pick N, or say whether the image is mirrored with --mirror or --no-mirror"
+            )
+        if self.out is not None:
+            say(f"{self.out} written, and {self.out.with_suffix('.png').name}, which shows the outline: look at it")
+            say(f"In a configuration: camera.registration = {json.dumps(str(self.out))}")
 
 
 def calibrate_image(
@@ -75,7 +126,7 @@ def calibrate_image(
         are = "is one pose" if len(poses) == 1 else f"are {len(poses)} poses"
         raise UsageError(f"--pick {pick}: there {are}; choose from 1 to {len(poses)}")
     chosen = poses[pick - 1] if pick is not None else poses[0] if len(poses) == 1 else None
-    done = ImageRegistration(picture, chip, poses, chosen, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"))
+    done = ImageRegistration(picture, chip, poses, chosen, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), out)
     if outputs and chosen is not None:
         drawing = png_of(overlay(picture.image, chip, chosen.calibration))
         write_outputs(outputs, (fragment(done, chosen).encode(), drawing))
@@ -114,55 +165,6 @@ def fragment(done: ImageRegistration, fit: WallFit) -> str:
     return as_toml(comments, {f"camera.{key}": value for key, value in settings_of(done, fit).items()})
 
 
-def figures(done: ImageRegistration) -> dict[str, Any]:
-    """The poses as plain numbers."""
-    poses = []
-    for fit in done.poses:
-        x, y, angle, scale = fit.std.tolist()
-        quality = {
-            "walls_found": round(fit.found, 4),
-            "walls_seen": round(fit.seen, 4),
-            "explained": round(fit.explained, 4),
-            "standard_error_um": [x, y],
-            "standard_error_deg": angle,
-            "standard_error_scale": scale,
-        }
-        poses.append(settings_of(done, fit) | quality)
-    chosen = next((n for n, fit in enumerate(done.poses) if fit is done.chosen), None)
-    return {"chip": done.chip.name, "poses": poses, "chosen": chosen, "covered": done.picture.covered.as_json()}
-
-
-def show(done: ImageRegistration, out: Path | None) -> None:
-    """Print the poses as a table.
-
-    Raises ChipError, in one line, if several are equally good and none was chosen.
-    """
-    rows = []
-    for number, fit in enumerate(done.poses, 1):
-        settings, (x, y, angle, scale) = settings_of(done, fit), fit.std.tolist()
-        rows.append(
-            (
-                str(number),
-                f"{settings['um_per_px']:.5g} ± {100 * scale:.1g} %",
-                f"{settings['angle_deg']:.3f} ± {angle:.1g}",
-                "yes" if settings["mirror"] else "no",
-                f"{settings['centre_um'][0]:.1f}, {settings['centre_um'][1]:.1f} ± {max(x, y):.1g}",
-                f"{fit.residual_um:.2g}",
-                f"{100 * fit.found:.0f} %",
-            )
-        )
-    columns = ("", "um per px", "angle (deg)", "mirror", "image centre (um)", "residual (um)", "walls found")
-    table(f"{done.chip.name} in {done.picture.source}", columns, rows)
-    if done.chosen is None:
-        raise ChipError(
-            f"{done.picture.source}: the chip {done.chip.name} looks the same in {len(done.poses)} ways; choose one of "
-            "the table with --pick N, or say whether the image is mirrored with --mirror or --no-mirror"
-        )
-    if out is not None:
-        say(f"{out} written, and {out.with_suffix('.png').name}, which shows the outline: look at it")
-        say(f"In a configuration: camera.registration = {json.dumps(str(out))}")
-
-
 def registration_state(camera: CameraSettings, now: datetime | None = None) -> tuple[bool, str]:
     """Age and quality of the registration of a camera: True if both are good, and one line on it, for people."""
     if not camera.registered_on:
@@ -183,8 +185,7 @@ def registration_state(camera: CameraSettings, now: datetime | None = None) -> t
     return True, text
 
 
-@dataclass(frozen=True, slots=True)
-class WallsState:
+class WallsState(NamedTuple):
     """Comparison of the walls in an image with a registration: True where they agree, and one line on it.
 
     `other_scale` : they contradict its scale.

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Coverage, Currents, FlowField, UsageError, __version__, say, seconds, table
+from flowrec.core import NS_PER_S, Coverage, Currents, FlowField, Ints, UsageError, __version__, say, seconds, table
 from flowrec.measure.motion_fit import LEAST_EXPLAINED_WITH_RATE, LEAST_FRAMES, MotionFit, fit_motion, refusal_of
 from flowrec.measure.motion_regression import Turns
 from flowrec.measure.motion_search import SearchRange
@@ -19,7 +17,6 @@ from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outp
 from flowrec.stages import MOVIE, FieldCommand, FieldLog, FieldState, Floats, field_motion, read_coil_log
 from flowrec.store import Session, files_behind
 
-Stamps = NDArray[np.int64]
 # A log on another clock: any offset, and rates of 30 % to either side.
 ANYWHERE = SearchRange(least_rate=0.7, largest_rate=1.0 / 0.7)
 _ONE_CLOCK = SearchRange(-2.0, 2.0)  # from command to motion
@@ -32,8 +29,7 @@ _SPARSE, _EVEN, _LEAST_SAMPLES = 2.0, 3.0, 10
 _POOR_OFFSET_S = 0.01  # larger errors cost the refined flow about a percent
 
 
-@dataclass(frozen=True, slots=True)
-class MotionCalibration:
+class MotionCalibration(NamedTuple):
     """The fit of a session, and the settings that it proposes."""
 
     fit: MotionFit
@@ -42,6 +38,29 @@ class MotionCalibration:
     sets: dict[str, float | bool]  # settings by key
     advice: tuple[str, ...]
     covered: Coverage  # images in which the robot was seen, of all
+    path: Path  # of the session
+    out: Path | None  # that the settings were written to
+
+    def as_json(self) -> dict[str, Any]:
+        """The fit as plain numbers; None where the movie does not determine one."""
+        return figures_of(self.fit) | {
+            "log": self.log,
+            "shared_clock": self.shared_clock,
+            "advice": list(self.advice),
+            "set": as_sets(self.sets),
+            "covered": self.covered.as_json(),
+        }
+
+    def show(self) -> None:
+        """Print the fit as a table, advice and settings."""
+        rows = rows_of(self.fit, shared_clock=self.shared_clock)
+        table(f"{self.path.name} against {self.log}", ("", "value and standard error"), rows)
+        for sentence in self.advice:
+            say(f"- {sentence}")
+        say(self.covered.amount)
+        if self.out is not None:
+            say(f"{self.out} written")
+        say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(self.sets)))
 
 
 def calibrate_motion(
@@ -83,14 +102,15 @@ def calibrate_motion(
     shared = coils is None and not imported
     sets, advice = _propose_settings(fit, session, shared_clock=shared, own_log=coils is None)
     covered = Coverage(len(tracks), len(every), "images", "show the robot")
-    motion = MotionCalibration(fit, name, shared, sets, advice, covered)
     if outputs:
-        write_outputs(outputs, (fragment(motion, path).encode(),))
-    return motion
+        source = f"By flowrec {__version__} calibrate motion from {path.name} and {name}."
+        comments = (source, *(f"{key}: {value}" for key, value in rows_of(fit)))
+        write_outputs(outputs, (as_toml(comments, dict(sorted(sets.items()))).encode(),))
+    return MotionCalibration(fit, name, shared, sets, advice, covered, path, out)
 
 
 def fit_log(
-    stamps_ns: Stamps,
+    stamps_ns: Ints,
     positions_um: Floats,
     log: FieldLog,
     within: SearchRange,
@@ -133,7 +153,7 @@ def sampled_s(log: FieldLog, image_s: float) -> float | None:
 
 
 def fit_samples(
-    stamps_ns: Stamps,
+    stamps_ns: Ints,
     positions_um: Floats,
     log: FieldLog,
     within: SearchRange,
@@ -152,11 +172,11 @@ def fit_samples(
     error_s = row_s / math.sqrt(12.0)
     fit = fit_log(stamps_ns, positions_um, log.interpolate(), within, flow, window=window, log_error_s=error_s)
     if not fit.refusal and fit.explained < LEAST_EXPLAINED_WITH_RATE:
-        fit = replace(fit, refusal=refusal_of(fit, LEAST_EXPLAINED_WITH_RATE))
+        fit = fit._replace(refusal=refusal_of(fit, LEAST_EXPLAINED_WITH_RATE))
     return fit
 
 
-def _means(stamps_ns: Stamps, positions_um: Floats, window: int) -> tuple[Stamps, Floats, Floats]:
+def _means(stamps_ns: Ints, positions_um: Floats, window: int) -> tuple[Ints, Floats, Floats]:
     """Mean stamps (m,) and positions (m, 2) of so many frames in turn, and when those are around the mean, in ns."""
     used = len(stamps_ns) // window * window
     stamps, places = stamps_ns[:used].reshape(-1, window), positions_um[:used].reshape(-1, window, 2)
@@ -263,13 +283,6 @@ def remarks(fit: MotionFit) -> list[str]:
     return sentences
 
 
-def fragment(motion: MotionCalibration, path: Path) -> str:
-    """The settings as TOML, with a comment on their source."""
-    comments = (f"{name}: {value}" for name, value in rows_of(motion.fit))
-    source = f"By flowrec {__version__} calibrate motion from {path.name} and {motion.log}."
-    return as_toml((source, *comments), dict(sorted(motion.sets.items())))
-
-
 def rows_of(fit: MotionFit, offset: tuple[str, str] | None = None, shared_clock: bool = False) -> list[tuple[str, str]]:
     """The fit for people, each value with its standard error; `offset`: another row for the offset."""
     name, factor = ("latency", -1e3) if shared_clock else ("time of log less time of movie", 1e3)
@@ -293,17 +306,6 @@ def rows_of(fit: MotionFit, offset: tuple[str, str] | None = None, shared_clock:
     return rows
 
 
-def figures(motion: MotionCalibration) -> dict[str, Any]:
-    """The fit as plain numbers; None where the movie does not determine one."""
-    return figures_of(motion.fit) | {
-        "log": motion.log,
-        "shared_clock": motion.shared_clock,
-        "advice": list(motion.advice),
-        "set": as_sets(motion.sets),
-        "covered": motion.covered.as_json(),
-    }
-
-
 def figures_of(fit: MotionFit) -> dict[str, Any]:
     """The fit as plain numbers."""
     values: dict[str, Any] = {
@@ -325,15 +327,3 @@ def figures_of(fit: MotionFit) -> dict[str, Any]:
         "refusal": fit.refusal,
     }
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
-
-
-def show(motion: MotionCalibration, path: Path, out: Path | None) -> None:
-    """Print the fit as a table, advice and settings."""
-    rows = rows_of(motion.fit, shared_clock=motion.shared_clock)
-    table(f"{path.name} against {motion.log}", ("", "value and standard error"), rows)
-    for sentence in motion.advice:
-        say(f"- {sentence}")
-    say(motion.covered.amount)
-    if out is not None:
-        say(f"{out} written")
-    say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(motion.sets)))

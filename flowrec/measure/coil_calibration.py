@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from flowrec.core import UsageError, refuse_irregular
+from flowrec.core import Floats, UsageError, refuse_irregular
 from flowrec.stages import WORST_CONDITION, direction_name
 
-Floats = NDArray[np.float64]
 _COLUMNS = ("i_x_a", "i_y_a", "i_z_a", "b_x_mt", "b_y_mt", "b_z_mt")
 _HEADER = ",".join(_COLUMNS)
 _UNIT_NAMES = {"a": "ampere", "mt": "millitesla"}
@@ -28,8 +26,7 @@ _NOMINAL_MT = 4.0
 _DIRECTIONS = 400  # in which the uncertainty is evaluated
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Excitations:
+class Excitations(NamedTuple):
     """Rows of the file. Axes are those of the chip: x and y as in the image, z up from the floor."""
 
     currents_a: Floats  # (n, 3)
@@ -109,8 +106,7 @@ def _number(name: str, cell: str, where: str) -> float:
     return value
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoilFit:
+class CoilFit(NamedTuple):
     """B = A i + b with uncertainties; arrays by axis of the field (rows) and coil (columns), both x, y, z."""
 
     excitations: Excitations

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,8 +68,7 @@ _GAIN, _GAIN_WITHOUT_FLOW = 0.02, 0.05  # relative: the flow along the way chang
 _HEADING_RAD = 0.009
 
 
-@dataclass(frozen=True, slots=True)
-class MotionFit:
+class MotionFit(NamedTuple):
     """Time of the log = offset_s + rate * time of the movie. Each `_std` is one standard error, inf if not known."""
 
     offset_s: float
@@ -87,11 +87,6 @@ class MotionFit:
     refusal: str  # why the fit must not be used, for people; '' if it may be
     frames: int  # that were used
     left_out: int  # frames with a position that the robot can not have reached
-
-    @property
-    def accepted(self) -> bool:
-        """True if the fit may be used."""
-        return not self.refusal
 
 
 def fit_motion(
@@ -229,7 +224,7 @@ def _result(
         frames=len(track.flags) - left_out,
         left_out=left_out,
     )
-    return replace(fit, refusal=_refusal(fit, ambiguous=ambiguous))
+    return fit._replace(refusal=_refusal(fit, ambiguous=ambiguous))
 
 
 def _explained_fraction(track: TrackRegression, fit: MotionRegression) -> float:

@@ -47,8 +47,7 @@ class Place(NamedTuple):
     mirrored: bool
 
 
-@dataclass(frozen=True, slots=True)
-class MotionRegression:
+class MotionRegression(NamedTuple):
     """The parameters at the optimum, and what they leave."""
 
     place: Place

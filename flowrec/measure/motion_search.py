@@ -11,7 +11,7 @@ correlation is by chance.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import fft
@@ -28,8 +28,7 @@ _KEPT = 24  # candidates of each search, best first
 _TAIL = 0.1  # fraction of the chance correlations that the exponential tail is fitted to
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
+class Candidate(NamedTuple):
     """A place in the log. Time of the log = offset_s + rate * time of the movie."""
 
     offset_s: float
@@ -38,8 +37,7 @@ class Candidate:
     r2: float  # fraction of the whitened motion that the log explains here
 
 
-@dataclass(frozen=True, slots=True)
-class SearchRange:
+class SearchRange(NamedTuple):
     """Bounds of the search: offsets at the middle of the movie, in s of the log less s of the movie, and rates."""
 
     first_offset_s: float = -math.inf

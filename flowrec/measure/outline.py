@@ -18,11 +18,10 @@ import numpy as np
 import scipy  # its ndimage and special load at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import Floats
+from flowrec.core import Floats, Ints
 from flowrec.measure.images import Levels, Mask, blur_image, draw_curves, fill_curves, gradient, shrink
 
 Walls = Literal["dark", "bright", "step"]
-Sizes = NDArray[np.int64]
 _PAD_PX = 24  # by which a channel goes on straight beyond the picture
 _STEP_PX = 0.5  # between two samples of a profile
 _LEAST_REACH_PX, _MOST_REACH_PX = 3.0, 14.0
@@ -268,7 +267,7 @@ def _along(values: Floats, sigma_px: float) -> Floats:
     return np.asarray(scipy.ndimage.gaussian_filter1d(values, sigma_px, axis=0, mode="wrap"))
 
 
-def _profiles(padded: Levels, points: Floats, normals: Floats, reach_px: float, sizes: Sizes) -> Floats:
+def _profiles(padded: Levels, points: Floats, normals: Floats, reach_px: float, sizes: Ints) -> Floats:
     """Grey levels (n, samples) across the walls, from solid to fluid, averaged along them."""
     count = round(reach_px / _STEP_PX)
     t = _STEP_PX * np.arange(-count, count + 1)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -182,7 +182,7 @@ def _refuse_undetermined(fit: WallFit, chip: Chip) -> None:
     loose = " and ".join(text for text, bad in zip(shown, _loose(fit), strict=True) if bad)
     if not loose:
         return
-    if not _loose(replace(fit, std=fit.apart)).any():
+    if not _loose(fit._replace(std=fit.apart)).any():
         raise ChipError(
             f"the walls of {chip.name} in the picture do not determine {loose}; show more of the chip, with walls of "
             "several directions"
@@ -199,8 +199,7 @@ def overlay(picture: Image, chip: Chip, calibration: Calibration) -> Colours:
     return with_curves(picture, (calibration.to_px(contour[:, 0] * chip.um_per_px) for contour in contours))[0]
 
 
-@dataclass(frozen=True, slots=True)
-class ImageVerdict:
+class ImageVerdict(NamedTuple):
     """Result of the comparison of the axes with a picture.
 
     Attributes

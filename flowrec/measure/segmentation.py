@@ -20,7 +20,7 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import ChipError, Floats, Image
+from flowrec.core import ChipError, Floats, Image, Ints
 from flowrec.measure.images import Levels, Mask, blur_image, draw_curves, shrink
 from flowrec.measure.outline import Outline, Walls, outline_of
 from flowrec.measure.wall_lines import divisions, otsu
@@ -145,7 +145,7 @@ def _holds_seeds(found: Segmentation, seeds: Seeds) -> bool:
     return all(mask[y, x] for x, y in seeds)
 
 
-def _pieces(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _pieces(mask: Mask) -> tuple[NDArray[np.int32], Ints]:
     """Numbers (h, w) of the pieces of a channel, from 1, and how often each meets the border of the picture."""
     labels, count = scipy.ndimage.label(mask)
     ends = np.zeros(count + 1, np.int64)

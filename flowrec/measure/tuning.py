@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +26,7 @@ _STEPS = 8  # of the bisection of these six decades: to 6 %
 _STD_PER_MAD = 1.4826  # of a normal distribution
 
 
-@dataclass(frozen=True, slots=True)
-class Tuned:
+class Tuned(NamedTuple):
     """Recommended settings."""
 
     position_noise_um: float

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -56,8 +56,7 @@ _LEAST_PIXELS = 30  # of a patch
 _LEAST_ALL = 200  # pixels of a fit
 
 
-@dataclass(frozen=True, slots=True)
-class WallFit:
+class WallFit(NamedTuple):
     """A pose with all that is known of its quality.
 
     Attributes
@@ -120,7 +119,7 @@ class Fitter:
             apart = self._apart(grey, contrast)
         if contrast.found >= _RELIEF_FOUND and grey.found < contrast.found - _RELIEF_MORE:
             return contrast
-        return replace(grey, std=np.hypot(grey.std, apart), apart=apart)
+        return grey._replace(std=np.hypot(grey.std, apart), apart=apart)
 
     def _apart(self, one: WallFit, other: WallFit) -> Floats:
         """(4,) difference of two poses, in the units of `WallFit.std`."""

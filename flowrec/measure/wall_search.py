@@ -12,7 +12,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -86,8 +87,7 @@ class WallMap:
         return np.stack((columns, rows), -1) - clearance_px[near][:, None] * normals, normals
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
+class Pose(NamedTuple):
     """A candidate: how the chip may lie in the image, and the significance of the correlation."""
 
     calibration: Calibration

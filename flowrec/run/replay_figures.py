@@ -52,7 +52,7 @@ class CommandDifference:
 
 
 class ReplayPair(Protocol):
-    """Two runs of one recording to be compared: a `Replayed`, or two session files.
+    """Two runs of one recording to be compared: a `Replay`, or two session files.
 
     Attributes
     ----------

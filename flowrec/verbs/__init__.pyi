@@ -7,13 +7,13 @@ from .listed import (
 )
 from .listing import NAMES as NAMES, describe as describe, read_each as read_each, runs_of as runs_of
 from .options import (
-    AsJson as AsJson, Asked as Asked, HELP_WIDTH as HELP_WIDTH, Overwrite as Overwrite, SetTexts as SetTexts, Stoppable as Stoppable,
-    WholeDescriptions as WholeDescriptions,
+    AsJson as AsJson, Asked as Asked, HELP_WIDTH as HELP_WIDTH, HTML as HTML, Overwrite as Overwrite, SetTexts as SetTexts,
+    Stoppable as Stoppable, WholeDescriptions as WholeDescriptions, require_packages as require_packages,
 )
 from .preparation import prepare as prepare, refuse_adrift as refuse_adrift
 from .replay_change import Change as Change, FIXED as FIXED
-from .replay_made import refinement_remarks as refinement_remarks, refly as refly
-from .report_page import HTML as HTML, require_packages as require_packages
+from .replay_made import refly as refly
+from .replay_result import refinement_remarks as refinement_remarks
 from .session_replay import replay_session as replay_session
 from .session_table import (
     AS_LIST as AS_LIST, SessionTable as SessionTable, SqlError as SqlError, connect as connect,

@@ -14,9 +14,9 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ _SETTLE_S = 0.1  # after the last image until it is written, on a machine with t
 _POLL_S = 0.005
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
+class Held(NamedTuple):
     """Rates that a trial has measured, in images a second.
 
     Attributes
@@ -112,19 +111,17 @@ def admit(
     if not isinstance(rig, Tried) or control.reason:
         return {}
     known = _after_first_order(rig, pipeline, worker, known, control)
-    best: Held | None = None
-    for _ in range(_TRIES):
+    trials: list[Held] = []
+    while len(trials) < _TRIES and not any(held.enough for held in trials):
         with _scratch(folder, config, chip) as writer:
             held = _trial(rig, pipeline, writer, known, config, control)
         if held is None:
             return {}
-        best = held if best is None or held.hz > best.hz else best
-        if best.enough:
-            break
-    assert best is not None
-    if not best.enough and not config.recording.accept_losses:
-        raise RigError(refusal(best, config, folder))
+        trials.append(held)
+    best = max(trials, key=lambda held: held.hz)
     if not best.enough:
+        if not config.recording.accept_losses:
+            raise RigError(refusal(best, config, folder))
         warn(f"this machine holds {best}: images will be lost (--accept-losses)")
     return {"admission": f"holds {best}"}
 

@@ -65,11 +65,12 @@ def asked_import(
     """
     config = config if config is not None else Config()
     given: dict[str, object] = {"path": str(movie)}
-    given |= {"coils": str(coils)} if coils is not None else {}
-    given |= {"times": str(times), "rate_hz": None} if times is not None else {}
-    given |= {"rate_hz": fps} if fps is not None else {}
-    given |= {"times": ""} if fps is not None and times is None else {}
-    given |= {"partial": True} if partial else {}
+    if coils is not None:
+        given["coils"] = str(coils)
+    if times is not None or fps is not None:  # one of them replaces both
+        given |= {"times": str(times or ""), "rate_hz": fps}
+    if partial:
+        given["partial"] = True
     asked, taken = with_exported(replace(config, rig=MOVIE, movie=replace(config.movie, **given)))  # type: ignore[arg-type]
     if taken:
         say(f"taken from the export of the session: {', '.join(taken)}")

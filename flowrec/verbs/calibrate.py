@@ -5,12 +5,13 @@ from typing import Annotated, Any
 
 import typer
 
-from flowrec.verbs.command import Told, add_verb, verb
+from flowrec.verbs.command import add_verb, verb
 from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions
 
 TomlOut = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="TOML", help="Write the settings as a section of a configuration.")
 ]
+Picture = Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")]
 
 
 class _Calibrations(WholeDescriptions):
@@ -28,12 +29,11 @@ def coils(
     file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
     out: TomlOut = None,
     overwrite: Overwrite = False,
-) -> Told:
+) -> object:
     """Fit the field per ampere of the coils and the bias to measured fields, with standard errors (section coils)."""
-    from flowrec.measure import calibrate_coils as by
+    from flowrec.measure import calibrate_coils
 
-    fit = by.calibrate_coils(file, out, overwrite)
-    return Told(lambda: by.figures(fit), lambda: by.show(fit, out))
+    return calibrate_coils(file, out, overwrite)
 
 
 @verb()
@@ -45,17 +45,16 @@ def motion(
     ] = None,
     out: TomlOut = None,
     overwrite: Overwrite = False,
-) -> Told:
+) -> object:
     """Fit um per revolution, latency and heading offset to the motion of the robot, with standard errors."""
-    from flowrec.measure import calibrate_motion as by
+    from flowrec.measure import calibrate_motion
 
-    fit = by.calibrate_motion(session, coils, out, overwrite)
-    return Told(lambda: by.figures(fit), lambda: by.show(fit, session, out))
+    return calibrate_motion(session, coils, out, overwrite)
 
 
 @verb()
 def image(
-    picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
+    picture: Picture,
     config: Annotated[
         Path | None, typer.Argument(help="Configuration (TOML) with the chip and, roughly, camera.um_per_px.")
     ] = None,
@@ -69,19 +68,18 @@ def image(
     ] = None,
     sets: Sets = None,
     overwrite: Overwrite = False,
-) -> Told:
+) -> object:
     """Find the chip in a picture: um per pixel, angle, mirror and origin (section camera); an overlay shows it."""
-    from flowrec.measure import calibrate_image as by
+    from flowrec.measure import calibrate_image
     from flowrec.stages import load_config
 
     inputs = [config] if config is not None else []
-    done = by.calibrate_image(picture, load_config(config, sets or ()), out, mirror, pick, overwrite, inputs)
-    return Told(lambda: by.figures(done), lambda: by.show(done, out), int(done.chosen is None))
+    return calibrate_image(picture, load_config(config, sets or ()), out, mirror, pick, overwrite, inputs)
 
 
 @verb("flowrec calibrate chip movie.avi --um-per-px 5 --inlet left:0 --inlet-speed 200 -o chip.toml")
 def chip(
-    picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
+    picture: Picture,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="TOML", help="Write the chip; mask and overlay (PNG) go beside it."),
@@ -112,14 +110,13 @@ def chip(
         typer.Option(metavar="UM", help="Move walls outwards by so much (negative: inwards), if widths are known."),
     ] = 0.0,
     overwrite: Overwrite = False,
-) -> Told:
+) -> object:
     """Make a chip of a picture: mask, openings and an overlay; the mask can be corrected in any paint program."""
-    from flowrec.measure import calibrate_chip as by
+    from flowrec.measure import calibrate_chip
 
-    done = by.calibrate_chip(
+    return calibrate_chip(
         picture, out, um_per_px, walls, seed_point or (), inlet or (), inlet_speed, channel, wall_shift, overwrite
     )
-    return Told(lambda: by.figures(done), lambda: by.show(done, out))
 
 
 calibrate = typer.Typer(

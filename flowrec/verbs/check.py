@@ -62,5 +62,6 @@ def check(
     path = session_path(session) if isinstance(session, Path | str) else session.path
     files = files_to_check(path)
     nbytes = sum(map(size_of, files))
-    with nullcontext(progress) if bar is None else bar(f"reading {path.name}", max(nbytes, 1), "bytes") as done:
+    told = progress or (lambda _: None)
+    with nullcontext(told) if bar is None else bar(f"reading {path.name}", max(nbytes, 1), "bytes") as done:
         return check_session(path, files, done, signers)

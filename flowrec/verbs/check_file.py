@@ -57,10 +57,10 @@ class FileCheck:
     read_bytes : how far it is.
     """
 
-    def __init__(self, path: Path, progress: Callable[[int], None] | None, before: int) -> None:
+    def __init__(self, path: Path, progress: Callable[[], None]) -> None:
         self.tally, self.found = Tally(), Audit(path, 0)
         self.read_bytes = 0
-        self._progress, self._before = progress, before  # of the files before
+        self._progress = progress
         self.verdict = Verdict(path, Coverage(0, 0, "bytes"))
         self._config: ResolvedConfig | None = None
         self._head_fault = ""
@@ -81,8 +81,7 @@ class FileCheck:
 
     def _at(self, read_bytes: int) -> None:
         self.read_bytes = read_bytes
-        if self._progress is not None:
-            self._progress(self._before + read_bytes)
+        self._progress()
 
     @property
     def topics(self) -> dict[str, int]:
@@ -241,13 +240,14 @@ class FileCheck:
         if found.region is not None:
             windows = found.outcome.get("frames_windows", "most of them are black outside of what the tracker read")
             verdict.fact("windows", f"{windows}; exact for the recorded tracker and robot only")
-        if dropped:
-            verdict.odd("drops", f"{dropped} images were dropped because the disk was too slow (counted by the writer)")
-        if tally.images_missing > dropped:
-            verdict.odd("drops", f"{tally.images_missing - dropped} images are missing without having been counted")
-        unseen = tally.index_steps - tally.images_missing
-        if unseen > 0:
-            verdict.odd("drops", f"{unseen} images of the camera never arrived, as their numbers show")
+        lost_images = {
+            "were dropped because the disk was too slow (counted by the writer)": dropped,
+            "are missing without having been counted": tally.images_missing - dropped,
+            "of the camera never arrived, as their numbers show": tally.index_steps - tally.images_missing,
+        }
+        for how, count in lost_images.items():
+            if count > 0:
+                verdict.odd("drops", f"{count} images {how}")
         losses = tally.losses
         if losses is not None:
             lost = {
@@ -310,13 +310,14 @@ class FileCheck:
             verdict.odd("replay", "it holds only the tick that it repeats from the part before")
         elif not tally.ticks:
             verdict.bad("replay", "there is no tick in it, so nothing to replay")
-        if tally.inputs_missing:
-            text = f"{tally.inputs_missing} of {tally.ticks} ticks lack inputs; a replay leaves them out"
-            verdict.odd("replay", text)
-        if tally.images_alone:
-            verdict.odd("replay", f"{tally.images_alone} ticks have only their image")
-        if tally.unfinished_ticks:
-            verdict.odd("replay", f"{tally.unfinished_ticks} ticks have inputs, but no results of the stages")
+        lacking = {
+            f"of {tally.ticks} ticks lack inputs; a replay leaves them out": tally.inputs_missing,
+            "ticks have only their image": tally.images_alone,
+            "ticks have inputs, but no results of the stages": tally.unfinished_ticks,
+        }
+        for what, count in lacking.items():
+            if count:
+                verdict.odd("replay", f"{count} {what}")
         lacks = tally.inputs_missing or tally.images_alone or self.found.missing.total()
         exact = NOT_EXACT if lacks else EXACT
         header = self.found.header

@@ -37,25 +37,28 @@ def files_to_check(path: Path) -> list[Path]:
 
 
 def check_session(
-    path: Path, files: Sequence[Path], progress: Callable[[int], None] | None, signers: Path | None = None
+    path: Path, files: Sequence[Path], progress: Callable[[int], None], signers: Path | None = None
 ) -> Verdict:
     """The verdict on the files of a session; parameters and errors as of `flowrec.check`."""
     total = sum(map(size_of, files))
     checks: list[FileCheck] = []
+
+    def read_bytes() -> int:
+        return sum(check.read_bytes for check in checks)
+
     for file in files:
-        before = sum(check.read_bytes for check in checks)
-        check = FileCheck(file, progress, before)
+        check = FileCheck(file, lambda: progress(read_bytes()))
+        checks.append(check)
         try:
             check.read()
         except KeyboardInterrupt as error:
             ended = Ended.of(error)
-            covered = Coverage(before + check.read_bytes, total, "bytes", stopped=ended.why, status=ended.status)
-            ended.result = _verdict_so_far(path, covered, [*checks, check])
+            covered = Coverage(read_bytes(), total, "bytes", stopped=ended.why, status=ended.status)
+            ended.result = _verdict_so_far(path, covered, checks)
             raise ended from error
-        checks.append(check)
         _check_signature(check.verdict, signers)
     verdict = checks[0].verdict if list(files) == [path] else _check_run(path, checks)
-    verdict.covered = Coverage(sum(check.read_bytes for check in checks), total, "bytes", topics=tuple(verdict.topics))
+    verdict.covered = Coverage(read_bytes(), total, "bytes", topics=tuple(verdict.topics))
     if all(check.found.header is not None for check in checks):
         verdict.covered = replace(verdict.covered, head=HEAD)
     amount, topics = verdict.covered.amount, len(verdict.topics)
@@ -97,21 +100,22 @@ def _verdict_so_far(path: Path, covered: Coverage, checks: Sequence[FileCheck]) 
 
 def _check_run(path: Path, checks: Sequence[FileCheck]) -> Verdict:
     """The verdict on all parts of a run together."""
-    run = Verdict(path, checks[0].verdict.covered, parts=[check.verdict for check in checks])
-    apart = [check.verdict for check in checks if check.verdict.integrity != CONSISTENT]
-    if len({check.verdict.integrity for check in checks}) == 1:
-        run.integrity = checks[0].verdict.integrity
-    elif apart:
-        run.integrity = f"{apart[0].path.name} is {apart[0].integrity}"
+    parts = [check.verdict for check in checks]
+    run = Verdict(path, parts[0].covered, parts=parts)
+    if len({part.integrity for part in parts}) == 1:
+        run.integrity = parts[0].integrity
+    else:
+        apart = next(part for part in parts if part.integrity != CONSISTENT)
+        run.integrity = f"{apart.path.name} is {apart.integrity}"
     first_ns, last = checks[0].found.first_ns, checks[-1].found
     parts_with: dict[CheckFinding, list[int]] = {}
     counts = Counter[str]()
-    for check in checks:
-        for finding in check.verdict.findings:
-            parts_with.setdefault(finding, []).append(part_number(check.verdict.path))
-        run.gap_count += check.verdict.gap_count
+    for check, part in zip(checks, parts, strict=True):
+        for finding in part.findings:
+            parts_with.setdefault(finding, []).append(part_number(part.path))
+        run.gap_count += part.gap_count
         later_s = seconds(check.found.first_ns - first_ns)
-        run.gaps += [Gap(gap.at_s + later_s, gap.length_s) for gap in check.verdict.gaps]
+        run.gaps += [Gap(gap.at_s + later_s, gap.length_s) for gap in part.gaps]
         counts.update(check.found.counts)
         counts.subtract(check.tally.repeated)
     for finding, numbers in parts_with.items():
@@ -128,18 +132,19 @@ def _check_run(path: Path, checks: Sequence[FileCheck]) -> Verdict:
     run.topics = {known[name]: count for name, count in counts.items() if count}
     ticks, size_bytes = sum(check.tally.ticks for check in checks), sum(check.found.size_bytes for check in checks)
     duration_s = seconds(last.last_ns - first_ns)
-    run.figures = {key: run.parts[-1].figures.get(key) for key in ("outcome", "note")} | {
-        "messages": counts.total(),
+    messages, frames = counts.total(), counts["frame"]
+    run.figures = {key: parts[-1].figures.get(key) for key in ("outcome", "note")} | {
+        "messages": messages,
         "size_bytes": size_bytes,
         "duration_s": duration_s,
         "ticks": ticks,
-        "frames": counts["frame"],
+        "frames": frames,
     }
-    run.fact("outcome", run.parts[-1].facts["outcome"])
-    run.fact("content", f"{counts.total()} messages on {len(run.topics)} topics in {size_bytes / 1e6:.1f} MB")
+    run.fact("outcome", parts[-1].facts["outcome"])
+    run.fact("content", f"{messages} messages on {len(run.topics)} topics in {size_bytes / 1e6:.1f} MB")
     run.fact("length", f"{duration_s:.2f} s, {ticks} ticks")
-    run.fact("images", f"{counts['frame']} for {ticks} ticks")
-    exact = all(part.facts["replay"].startswith(EXACT) for part in run.parts)
+    run.fact("images", f"{frames} for {ticks} ticks")
+    exact = all(part.facts["replay"].startswith(EXACT) for part in parts)
     run.fact("replay", "no" if run.word == "bad" else "yes; each part alone, too" if exact else NOT_EXACT)
     return run
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from flowrec.core import (
     FIXED,
     NUMERICS_VERSION,
     TOPICS,
+    Floats,
     Message,
     Role,
     Source,
@@ -30,8 +31,12 @@ Fields = Mapping[str, frozenset[str]]  # names of message fields, by field of Ti
 _Deviation = tuple[float, tuple[int, ...] | None, object, object]  # excess over the tolerance, index, both values
 
 
+def _names_of(topic: Topic) -> list[str]:
+    return [each.name for each in fields(topic.type)]  # type: ignore[arg-type]
+
+
 def _fields_of(topics: Iterable[Topic]) -> dict[str, frozenset[str]]:
-    return {topic.field: frozenset(each.name for each in fields(topic.type)) for topic in topics}  # type: ignore[arg-type]
+    return {topic.field: frozenset(_names_of(topic)) for topic in topics}
 
 
 _ALL = _fields_of(TOPICS)
@@ -80,8 +85,8 @@ class Side:
         if topic.field not in self.recorded:
             copied = self.copy and topic.field == "frame"
             return {topic.path: f"not copied into {self.name}" if copied else f"not recorded in {self.name}"}
-        missing = _fields_of([topic])[topic.field] - self.recorded[topic.field]
-        return {f"{topic.path} {name}": f"not recorded in {self.name}" for name in sorted(missing)}
+        missing = sorted({*_names_of(topic)} - self.recorded[topic.field])
+        return {f"{topic.path} {name}": f"not recorded in {self.name}" for name in missing}
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,12 +158,7 @@ class TopicCount:
 
     def as_json(self) -> dict[str, Any]:
         """The result for JSON."""
-        return {
-            "identical": self.identical,
-            "within_tolerance": self.within_tolerance,
-            "different": self.different,
-            "first": self.first.as_json() if self.first is not None else None,
-        }
+        return asdict(self) | {"first": self.first.as_json() if self.first is not None else None}
 
 
 @dataclass(slots=True)
@@ -195,8 +195,8 @@ class Comparison:
         self._compared = [topic for topic in topics if topic.role in self.roles and topic.path not in self.left_out]
         for topic in topics:
             lacking = self.sides[0].lacks(topic) | self.sides[1].lacks(topic)
-            names = [each.name for each in fields(topic.type) if f"{topic.path} {each.name}" not in lacking]  # type: ignore[arg-type]
-            self._names[topic.field] = [] if topic.path in lacking else names
+            names = [] if topic.path in lacking else _names_of(topic)
+            self._names[topic.field] = [name for name in names if f"{topic.path} {name}" not in lacking]
             if topic.role is not Role.DIAGNOSTIC:
                 self.not_recorded |= lacking
 
@@ -349,13 +349,13 @@ def _deviation(was: object, now: object, rtol: float, atol: float) -> _Deviation
     return math.inf, None, _form(was), _form(now)
 
 
-def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> NDArray[np.float64]:
+def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> Floats:
     """|was - now| / (atol + rtol |was|) per element; values that are not finite equal only the same value."""
     a, b = np.asarray(was, np.float64), np.asarray(now, np.float64)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))
         ratio = np.abs(a - b) / (atol + rtol * np.abs(a))
-    excess: NDArray[np.float64] = np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
+    excess: Floats = np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
     return excess
 
 

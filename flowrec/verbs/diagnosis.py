@@ -6,9 +6,10 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import starmap
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -67,8 +68,7 @@ _CAUSES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(NamedTuple):
     """One line.
 
     Attributes
@@ -88,7 +88,8 @@ class Finding:
         return f"{_SIGNS[self.level]} {self.what:12s} {self.text}"
 
 
-Findings = Generator[Finding, None, None]
+_Row = tuple[str, str, str]  # the fields of a finding
+_Rows = Generator[_Row, None, None]
 
 
 def diagnose(
@@ -102,9 +103,13 @@ def diagnose(
     folder : where sessions are written; None: the present one.
     wrong : why the configuration was refused, and `asked` is only what is right of it; "" if it was not.
     """
+    return starmap(Finding, _rows(asked, config_file, folder, wrong))
+
+
+def _rows(asked: Config, config_file: Path | None, folder: Path | None, wrong: str) -> Iterator[_Row]:
     settled: tuple[ResolvedConfig, Chip | None] | None = None
     if wrong:
-        yield Finding("settings", FAILURE, wrong)
+        yield "settings", FAILURE, wrong
     else:
         settled = yield from _look("settings", _settings, asked)
     if settled is None and asked.rig == LAB:
@@ -120,37 +125,35 @@ def diagnose(
             yield from _look("coils", _coils, config)
         else:
             text = f"rig = {asked.rig!r}: neither camera nor coils are looked at; give the configuration of the lab"
-            yield Finding("devices", WARNING, f"{text}, with rig = 'lab'")
+            yield "devices", WARNING, f"{text}, with rig = 'lab'"
         yield from _look("disk", _disk, config, folder or Path())
     yield from _calibrations(asked, config_file)
     yield _viewer()
 
 
-def _look(
-    what: str, check: Callable[..., Generator[Finding, None, T]], *given: Any
-) -> Generator[Finding, None, T | None]:
+def _look(what: str, check: Callable[..., Generator[_Row, None, T]], *given: Any) -> Generator[_Row, None, T | None]:
     """The findings of a check; an error, which says in its line what to do, is a failure."""
     try:
         return (yield from check(*given))
     except FlowrecError as error:
-        yield Finding(what, FAILURE, str(error))
+        yield what, FAILURE, str(error)
     except OSError as error:
-        yield Finding(what, FAILURE, f"{error.strerror or error}; see to it, then try again")
+        yield what, FAILURE, f"{error.strerror or error}; see to it, then try again"
     return None
 
 
-def _without_settings(asked: Config) -> Generator[Finding, None, tuple[ResolvedConfig, None]]:
+def _without_settings(asked: Config) -> Generator[_Row, None, tuple[ResolvedConfig, None]]:
     config = stand_in(asked)
     text = "what is wrong or missing in the settings is made up to look at them; mission and walls are left out"
-    yield Finding("devices", WARNING, text)
+    yield "devices", WARNING, text
     return config, None
 
 
-def _settings(asked: Config) -> Generator[Finding, None, tuple[ResolvedConfig, Chip]]:
+def _settings(asked: Config) -> Generator[_Row, None, tuple[ResolvedConfig, Chip]]:
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
     camera = config.camera
-    yield Finding(
+    yield (
         "settings",
         OK,
         f"chip {chip.name}; {camera.width_px} x {camera.height_px} pixels of {camera.bits} bit at {camera.rate_hz:g} "
@@ -159,135 +162,131 @@ def _settings(asked: Config) -> Generator[Finding, None, tuple[ResolvedConfig, C
     return config, chip
 
 
-def _mission(config: ResolvedConfig, chip: Chip) -> Findings:
+def _mission(config: ResolvedConfig, chip: Chip) -> _Rows:
     mission = config.mission
     if mission.observes:
-        yield Finding("mission", OK, "observes: the coils are not used")
+        yield "mission", OK, "observes: the coils are not used"
         return
     refuse_adrift(config, chip)
     route = route_on_assumed_flow(config, chip)
     if not route.reachable:
-        yield Finding("mission", FAILURE, f"no route on the assumed flow: {route.reason}; choose another goal")
+        yield "mission", FAILURE, f"no route on the assumed flow: {route.reason}; choose another goal"
         return
     length_mm = 1e-3 * float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
-    yield Finding(
-        "mission", OK, f"{', '.join(mission.phases)}; a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s"
-    )
+    yield "mission", OK, f"{', '.join(mission.phases)}; a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s"
 
 
-def _kernels(config: ResolvedConfig) -> Findings:
+def _kernels(config: ResolvedConfig) -> _Rows:
     """Compile what a live run would compile before it begins."""
     known = kernels_cached()
     begin_s = time.perf_counter()
     rehearse(config)
     if not kernels_cached():
         text = "can not be kept, no folder for a cache can be written: each run compiles them, half a minute before it"
-        yield Finding("kernels", WARNING, f"{text}; set XDG_CACHE_HOME to a folder of your own")
+        yield "kernels", WARNING, f"{text}; set XDG_CACHE_HOME to a folder of your own"
         return
     once = f"compiled in {time.perf_counter() - begin_s:.0f} s, once after an installation"
     text = "compiled before" if known else once
-    yield Finding("kernels", OK, f"{text}; a short simulated mission with this configuration's methods went through")
+    yield "kernels", OK, f"{text}; a short simulated mission with this configuration's methods went through"
 
 
-def _camera(config: ResolvedConfig, chip: Chip | None) -> Findings:
+def _camera(config: ResolvedConfig, chip: Chip | None) -> _Rows:
     from flowrec.rigs import probe_camera
 
     camera = config.camera
     seen = probe_camera(camera, config.lab)
     info = seen.info
     name = " ".join(filter(None, (info.model, info.serial)))
-    yield Finding("camera", OK, f"{name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}")
+    yield "camera", OK, f"{name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}"
     if (info.width_px, info.height_px, info.bits) != (camera.width_px, camera.height_px, camera.bits):
-        yield Finding(
+        yield (
             "camera",
             FAILURE,
             f"its images are {info.width_px} x {info.height_px} pixels of {info.bits} bit; set camera.width_px, "
             "camera.height_px and camera.bits to that",
         )
-    yield from (Finding("camera", WARNING, note) for note in seen.notes)
+    yield from (("camera", WARNING, note) for note in seen.notes)
     wrong = abs(seen.rate_hz / camera.rate_hz - 1.0) > _RATE_TOLERANCE
     text = f"{seen.rate_hz:.1f} frames per second, longest interval {seen.arrival_ms:.0f} ms"
     advice = f", where camera.rate_hz = {camera.rate_hz:g}: set it, a shorter exposure or a smaller image"
-    yield Finding("rate", WARNING if wrong else OK, text + (advice if wrong else ""))
+    yield "rate", WARNING if wrong else OK, text + (advice if wrong else "")
     yield from _losses(seen.losses)
     if not seen.clock_slope:
-        yield Finding("clock", WARNING, "the camera has no clock that can be used: frames are stamped by their arrival")
+        yield "clock", WARNING, "the camera has no clock that can be used: frames are stamped by their arrival"
     elif abs(seen.clock_slope - 1.0) > _CLOCK_TOLERANCE:
         text = (
             f"the camera's clock runs at {seen.clock_slope:.4g} of what it states; its true rate is measured in a run"
         )
-        yield Finding("clock", WARNING, text)
+        yield "clock", WARNING, text
     else:
-        yield Finding(
-            "clock", OK, f"{1e6 * (seen.clock_slope - 1.0):+.0f} ppm from the host's, within what 2.5 s can tell"
-        )
+        yield "clock", OK, f"{1e6 * (seen.clock_slope - 1.0):+.0f} ppm from the host's, within what 2.5 s can tell"
     full = 2**info.bits - 1
     if seen.brightest >= full:
-        yield Finding("image", WARNING, "overexposed: some pixels are at the highest grey level; shorten the exposure")
+        yield "image", WARNING, "overexposed: some pixels are at the highest grey level; shorten the exposure"
     elif seen.brightest < _DARK * full:
         text = f"dark: the brightest pixel has level {seen.brightest} of {full}; more light, exposure or lab.gain"
-        yield Finding("image", WARNING, text)
+        yield "image", WARNING, text
     else:
-        yield Finding("image", OK, f"brightest pixel {seen.brightest} of {full}")
+        yield "image", OK, f"brightest pixel {seen.brightest} of {full}"
     if chip is not None and seen.image is not None and seen.image.shape == (camera.height_px, camera.width_px):
         yield from _walls(config, chip, seen.image)
 
 
-def _walls(config: ResolvedConfig, chip: Chip, image: Image) -> Iterator[Finding]:
+def _walls(config: ResolvedConfig, chip: Chip, image: Image) -> Iterator[_Row]:
     """The orientation of the chip in the image; and whether it still lies as registered, if the image shows enough."""
     stated = registration_of(config.camera, chip)
     seen = orientation_by_image(image, chip, stated)
     if seen.contradiction:
-        yield Finding("axes", FAILURE, seen.text)
+        yield "axes", FAILURE, seen.text
         return
     observes = config.mission.observes
     later = "" if seen.decided or observes else "; the motion tells at the beginning of a run"
-    yield Finding("axes", WARNING if observes and not seen.alike else OK, seen.text + later)
+    yield "axes", WARNING if observes and not seen.alike else OK, seen.text + later
     found = walls_state(image, chip, stated)
     if found is not None:
-        yield Finding("walls", OK if found.good else WARNING, found.text)
+        yield "walls", OK if found.good else WARNING, found.text
 
 
-def _losses(losses: CameraLosses | None) -> Iterator[Finding]:
+def _losses(losses: CameraLosses | None) -> Iterator[_Row]:
     if losses is None:
         return
     total = max(losses.ids, 1)
     found = {cause: getattr(losses, cause) for cause in _CAUSES if getattr(losses, cause)}
     if not found:
-        yield Finding("losses", OK, f"none of {losses.ids} images")
+        yield "losses", OK, f"none of {losses.ids} images"
     for cause, count in found.items():
         share = count / total
         level = FAILURE if share > _LOSS_FAILURE else WARNING if share > _LOSS_WARNING else OK
-        yield Finding("losses", level, f"{count} of {losses.ids} images {_CAUSES[cause]}")
+        yield "losses", level, f"{count} of {losses.ids} images {_CAUSES[cause]}"
 
 
-def _coils(config: ResolvedConfig) -> Findings:
+def _coils(config: ResolvedConfig) -> _Rows:
     if config.mission.observes:
-        yield Finding("coils", OK, "not used by a mission that observes")
+        yield "coils", OK, "not used by a mission that observes"
         return
     from flowrec.rigs import probe_amplifier
 
     seen = probe_amplifier(config)
     info = seen.info
     timer = f"goes to zero by itself after {info.timer_s:g} s" if info.timer_s else "holds its last output by itself"
-    yield Finding("amplifier", OK, f"{' '.join(filter(None, (info.model, info.serial)))}; {timer}")
-    yield Finding(
+    yield "amplifier", OK, f"{' '.join(filter(None, (info.model, info.serial)))}; {timer}"
+    yield (
         "limits",
         OK,
         f"{config.coils.max_current_a:g} A and {config.coils.amplifier.max_voltage_v:g} V a coil: "
         f"{seen.amplitude_mt:.3g} mT up to {seen.rotation_hz:.3g} Hz, {config.lab.output.longest_on_s:g} s at a time",
     )
-    yield Finding(
+    yield (
         "guardian",
         OK,
         f"its process starts, and takes the output to zero {1e3 * seen.trip_s:.1f} ms after it is asked to",
     )
     yield _silence(config)
-    yield from (Finding("coils", WARNING, text) for text in seen.warnings)
-    yield Finding("interlock", WARNING, f"can not be seen from here: {ONLY_HARDWARE}")
+    yield from (("coils", WARNING, text) for text in seen.warnings)
+    yield "interlock", WARNING, f"can not be seen from here: {ONLY_HARDWARE}"
 
 
-def _silence(config: ResolvedConfig) -> Finding:
+def _silence(config: ResolvedConfig) -> _Row:
     """Tell the guardian that a field is on, which is not, and fall silent."""
     amplifier = AMPLIFIERS[config.lab.amplifier].load().of(config)
     amplifier.open()
@@ -299,24 +298,24 @@ def _silence(config: ResolvedConfig) -> Finding:
             try:
                 guardian.beat(energised=False)
             except RigError as error:
-                return Finding("guardian", OK, f"when a loop falls silent: {error}")
+                return "guardian", OK, f"when a loop falls silent: {error}"
     finally:
         amplifier.close()
-    return Finding("guardian", FAILURE, "it does not notice that a loop falls silent; do not record with these coils")
+    return "guardian", FAILURE, "it does not notice that a loop falls silent; do not record with these coils"
 
 
-def _disk(config: ResolvedConfig, folder: Path) -> Findings:
+def _disk(config: ResolvedConfig, folder: Path) -> _Rows:
     speed = _write_speed(folder)
     need = image_bytes_s(config) / _PACKED[frames_of(config)]
     left = max(shutil.disk_usage(folder).free - 1e9 * config.recording.disk_floor_gb, 0.0)
     minutes = left / max(need, 1.0) / 60.0
     text = f"writes {speed / 1e6:.0f} MB/s, a run needs {need / 1e6:.0f}; room for {minutes:.0f} min"
     if speed < need:
-        yield Finding("disk", FAILURE, f"{text}: images would be dropped; use a faster disk or a smaller image")
+        yield "disk", FAILURE, f"{text}: images would be dropped; use a faster disk or a smaller image"
     elif speed < _HEADROOM * need or minutes < _LEAST_MINUTES:
-        yield Finding("disk", WARNING, f"{text}: use another disk (--out), or recording.region = 'robot'")
+        yield "disk", WARNING, f"{text}: use another disk (--out), or recording.region = 'robot'"
     else:
-        yield Finding("disk", OK, text)
+        yield "disk", OK, text
 
 
 def _write_speed(folder: Path) -> float:
@@ -334,33 +333,29 @@ def _write_speed(folder: Path) -> float:
         trial.unlink(missing_ok=True)
 
 
-def _calibrations(config: Config, file: Path | None) -> Iterator[Finding]:
+def _calibrations(config: Config, file: Path | None) -> Iterator[_Row]:
     """Calibrations, which only a measurement gives, and the last change of the configuration that holds them."""
     if config.rig != LAB:
         return
     driven = not config.mission.observes
     if driven and config.coils.mt_per_a == Coils().mt_per_a:
-        yield Finding("coils", WARNING, "coils.mt_per_a is the default; measure it: flowrec calibrate coils TABLE.csv")
+        yield "coils", WARNING, "coils.mt_per_a is the default; measure it: flowrec calibrate coils TABLE.csv"
     fresh, text = registration_state(config.camera)
-    yield Finding("registration", OK if fresh else WARNING, text)
+    yield "registration", OK if fresh else WARNING, text
     if file is None:
         return
     days = (time.time() - file.stat().st_mtime) / 86_400.0
     old = days > _OLD_DAYS
     text = f"{file} was last changed {days:.0f} days ago"
-    yield Finding(
-        "calibrations", WARNING if old else OK, text + ("; measure again what has moved since" if old else "")
-    )
+    yield ("calibrations", WARNING if old else OK, text + ("; measure again what has moved since" if old else ""))
 
 
-def _viewer() -> Finding:
+def _viewer() -> _Row:
     if executable() is None:
-        return Finding("viewer", WARNING, "Rerun's viewer is not installed: pip install rerun-sdk")
+        return "viewer", WARNING, "Rerun's viewer is not installed: pip install rerun-sdk"
     if not has_display():
-        return Finding(
-            "viewer", WARNING, "there is no screen here: record with --view serve and watch from another one"
-        )
-    return Finding("viewer", OK, "Rerun's viewer is there")
+        return "viewer", WARNING, "there is no screen here: record with --view serve and watch from another one"
+    return "viewer", OK, "Rerun's viewer is there"
 
 
 def of_devices(file: Path | None, sets: Mapping[str, Any], wrong: UsageError) -> Config:

@@ -1,7 +1,6 @@
 """`flowrec doctor`: is the lab ready for a run? And the same look at it for `flowrec record --dry-run`."""
 
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,7 +44,7 @@ class Diagnosis:
 
     def as_json(self) -> dict[str, Any]:
         """For JSON."""
-        return {"level": self.level, "findings": [asdict(one) for one in self.findings]}
+        return {"level": self.level, "findings": [one._asdict() for one in self.findings]}
 
 
 @verb("flowrec doctor lab.toml")

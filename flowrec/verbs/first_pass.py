@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, PICTURE, Frame, Image, Output, Track, UsageError, say, seconds, shift_px
+from flowrec.core import (
+    NS_PER_S,
+    PICTURE,
+    Floats,
+    Frame,
+    Image,
+    Ints,
+    Output,
+    Track,
+    UsageError,
+    say,
+    seconds,
+    shift_px,
+)
 from flowrec.rigs import MovieSource
 from flowrec.stages import (
     MOST,
@@ -42,11 +55,8 @@ _PX = "px"
 _SIDE_PX = 1200  # of the picture of candidates, about
 _AMBER, _BLACK = (38, 140, 255), (0, 0, 0)  # blue, green, red
 
-Floats = NDArray[np.float64]
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MovieTracks:
+class MovieTracks(NamedTuple):
     """Track of the robot in the images of a movie, before anything is recorded.
 
     Attributes
@@ -60,7 +70,7 @@ class MovieTracks:
     doubts : about the track.
     """
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Ints
     positions_um: Floats
     log: FieldLog
     shake_px: float | None
@@ -112,13 +122,12 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
     if robot and marked:
         raise UsageError(f"--robot {robot}: tracker.click_px or box_px is set too; give one of them")
     prepared = prepare(looked_at, aloud=False)  # the import says it, of the settings that are used
-    place_px = _place_of(robot, asked, prepared.pipeline)
+    p, movie = prepared.pipeline, looked_at.movie
+    place_px = _place_of(robot, asked, p)
     if place_px is not None:
         asked = replace(asked, tracker=replace(asked.tracker, click_px=place_px))
-    p, movie = prepared.pipeline, looked_at.movie
-    if place_px is None and not marked:
-        seen = _first_seen(p, movie, prepared)
-        asked = _with_chosen_body(asked, p, *seen, robot, folder) if seen is not None else asked
+    elif not marked and (seen := _first_seen(p, movie, prepared)) is not None:
+        asked = _with_chosen_body(asked, p, *seen, robot, folder)
     click = asked.tracker
     p = replace(p, tracker=replace(p.tracker, click_px=click.click_px, click_frame=click.click_frame))
     shifts_px, tracks = _look_through(p, movie, prepared)
@@ -128,7 +137,7 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
         asked, facts = _with_mean_shift(asked, shifts_px)
         if tracks is not None:  # as they are with the shift of the first image that was found
             by_um = p.calibration.to_um(first_px) - p.calibration.to_um(asked.stabilise.first_px)
-            tracks = replace(tracks, positions_um=tracks.positions_um + by_um)
+            tracks = tracks._replace(positions_um=tracks.positions_um + by_um)
     return Looked(asked, facts, prepared, tracks)
 
 

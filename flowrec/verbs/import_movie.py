@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flowrec.verbs.command import Told, verb
-from flowrec.verbs.options import ATTENDED, AsConfig, Asked, Overwrite, Sets, readable_toml
+from flowrec.verbs.options import ATTENDED, AsConfig, Asked, Overwrite, SessionOut, Sets, readable_toml
 from flowrec.verbs.record import config_of_call
 
 if TYPE_CHECKING:
@@ -30,9 +30,7 @@ def import_movie(
         Path | str,
         typer.Argument(help="Movie: AVI, MP4, MKV, MOV, TIFF, ND2, OME-Zarr, or a folder of images."),
     ],
-    out: Annotated[
-        Path | str | None, typer.Option("--out", "-o", help="Session file; by default named by date and sample.")
-    ] = None,
+    out: SessionOut = None,
     config: Annotated[AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML).")] = None,
     *,
     coils: Annotated[
@@ -89,14 +87,4 @@ def import_movie(
     asked = asked_import(movie, chosen, coils=coils, times=times, fps=fps, partial=partial)
     path = None if out is None else Path(out)
     looked = fit_import(asked, path.parent if path is not None else Path(), str(robot), align=align)
-    return run_mission(
-        looked.asked,
-        path,
-        overwrite=overwrite,
-        control=control,
-        inputs=inputs,
-        keep_failed=False,
-        given_facts=looked.facts,
-        known=looked.prepared,
-        given_doubts=looked.doubts,
-    )
+    return run_mission(looked.asked, path, overwrite=overwrite, control=control, inputs=inputs, looked=looked)

@@ -15,7 +15,7 @@ from flowrec.verbs.command import verb
 from flowrec.verbs.options import SessionFile
 
 if TYPE_CHECKING:
-    from flowrec.store import Part, Run
+    from flowrec.store import Part
 
 
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
@@ -23,7 +23,10 @@ _PNG_SIZE_AT = 16
 _REPEATED = ("reason", "duration")  # the second is a sentence of older files
 _STATED = ("seed", "world", "operator", "sample", "notes")  # in the provenance
 _OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance
-_CLOCK_READINGS = ("wall_ns", "monotonic_ns")
+# Shown with another fact, or not at all.
+_WITHIN_OTHERS = ("note", "parts", "commit", "local_changes", "chip_width_um", "chip_height_um", "chip_openings")
+_NOT_SHOWN = ("duration", "wall_ns", "monotonic_ns")
+_STAGES = ("observer", "refine", "plan", "control")
 
 
 class Facts(dict[str, Any]):
@@ -72,14 +75,14 @@ def info(session: SessionFile) -> Facts:
     provenance = header.provenance
     facts = {
         "outcome": outcome.get("outcome", "unknown"),
-        "note": _why(outcome),
+        "note": outcome.get("note") or outcome.get("reason", ""),  # the second is that of a failed run
         "duration_s": session.duration_s,
-        "size_bytes": _size(run),
+        "size_bytes": sum(file.size_bytes for file in run.files),
         "parts": len(run.files) if run.in_parts else None,
         **_chip(toml_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
         "rig": _name(session.setting("rig")),
         "phases": [str(phase) for phase in phases] if isinstance(phases, list) else [],
-        **{stage: _name(session.setting(stage, "method")) for stage in ("observer", "refine", "plan", "control")},
+        **{stage: _name(session.setting(stage, "method")) for stage in _STAGES},
         "recorded": provenance.get("wall_time", "unknown"),
         "flowrec": provenance.get("flowrec", "?"),
         "commit": provenance.get("git_commit"),
@@ -107,7 +110,6 @@ def info(session: SessionFile) -> Facts:
 
 def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The known facts of `info` as names and text."""
-    stages = ("observer", "refine", "plan", "control")
     width_um, height_um = facts.get("chip_width_um"), facts.get("chip_height_um")
     size = f", {width_um / 1000:.2f} x {height_um / 1000:.2f} mm" if width_um and height_um else ""
     changed = ", with local changes" if facts["local_changes"] else ""
@@ -118,7 +120,7 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         "chip": f"{facts['chip']}{size}, {facts['chip_openings']} openings",
         "recorded": facts["recorded"][:19].replace("T", " "),
         "phases": " -> ".join(facts["phases"]) or "?",
-        "observer": ", ".join(facts[stage] for stage in stages),
+        "observer": ", ".join(facts[stage] for stage in _STAGES),
         "derived": ", ".join(f"{key} = {value}" for key, value in facts["derived"].items()),
         "outside": "; ".join(
             f"{key} of {of['package']} {of['version']}, sha256 {of.get('sha256', '')[:16]}"
@@ -129,25 +131,11 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     words |= {"notes_added": "; ".join(facts["notes_added"]), "tags": ", ".join(facts["tags"])}
     words |= {key: str(code)[:16] for key, code in facts.items() if key.endswith("_sha256")}
     names = {"observer": "stages", "flowrec": "by flowrec", "outside": "other packages"}
-    without = (
-        "note",
-        "parts",
-        "commit",
-        "local_changes",
-        "chip_width_um",
-        "chip_height_um",
-        "chip_openings",
-        "duration",
-    )
     return [
         (names.get(key, name_of(key)), words.get(key) or text_of_figure(key, value))
         for key, value in facts.items()
-        if key not in (*without, *stages[1:], *_CLOCK_READINGS) and value not in (None, "", {}, [])
+        if key not in (*_WITHIN_OTHERS, *_NOT_SHOWN, *_STAGES[1:]) and value not in (None, "", {}, [])
     ]
-
-
-def _size(run: "Run") -> int:
-    return sum(file.size_bytes for file in run.files)
 
 
 def _piece(part: "Part", path: Path) -> str:
@@ -189,8 +177,3 @@ def _name(setting: Any) -> str:
 
 def _in_brackets(text: str) -> str:
     return f" ({text})" if text else ""
-
-
-def _why(outcome: Mapping[str, str]) -> str:
-    """The note of an outcome or, of a failed run, its reason."""
-    return outcome.get("note") or outcome.get("reason", "")

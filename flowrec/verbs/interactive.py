@@ -196,20 +196,21 @@ class StatusLine:
         queue_mb, drops = (timing.queue_mb, timing.dropped_frames) if timing is not None else (0.0, 0)
         error = tick.demand.error_um if tick.demand is not None else float("nan")
         # In the order of their worth: what does not fit into the line is left out from the end.
-        parts = [
-            *(["HELD"] if mission is not None and mission.held_since_ns is not None else []),
+        every = [
+            "HELD" if mission is not None and mission.held_since_ns is not None else "",
             f"{phase}{wait}",
-            *([f"limit {limit_um_s:g} um/s"] if limit_um_s is not None else []),
+            f"limit {limit_um_s:g} um/s" if limit_um_s is not None else "",
             f"{seconds(tick.stamp_ns):.1f} s",
-            *([f"{drops} images dropped"] if drops else []),
+            f"{drops} images dropped" if drops else "",
             f"error {error:.0f} um" if np.isfinite(error) else "no route",
-            *([f"queue {queue_mb:.0f} MB"] if queue_mb >= _QUEUE_SHOWN_MB else []),
+            f"queue {queue_mb:.0f} MB" if queue_mb >= _QUEUE_SHOWN_MB else "",
             self._disk(),
             f"{rate:.0f} images/s",
             f"tick {latency[0]:.1f} ms",
             f"p99 {latency[1]:.1f} ms",
             f"file {self._file_bytes() / 1e6:.0f} MB",
         ]
+        parts = [part for part in every if part]
         fits = [k for k in range(1, len(parts) + 1) if len("  ".join(parts[:k])) < console.width]
         return Text("  ".join(parts[: max(fits, default=1)]), style="bold", no_wrap=True, overflow="ellipsis")
 

@@ -94,25 +94,17 @@ def describe(path: Path, files: Sequence[Path], name: str) -> tuple[ListedSessio
     files : its own, as `runs_of` returns them.
     name : which the row has.
     """
+    parts = len(files) if list(files) != [path] else 0
     try:
         session = Session(path)
         facts = info(session)
-        row = ListedSession(
-            name,
-            facts["outcome"],
-            facts["note"],
-            facts["size_bytes"],
-            facts["duration_s"],
-            facts["chip"],
-            facts["recorded"],
-            facts["parts"] or (len(files) if list(files) != [path] else 0),
-            {**facts, "operator_events": session.topics.get("/operator/events", 0)},
-        )
+        own = {key: facts[key] for key in ("outcome", "note", "size_bytes", "duration_s", "chip", "recorded")}
+        events = session.topics.get("/operator/events", 0)
+        row = ListedSession(name, **own, parts=facts["parts"] or parts, facts={**facts, "operator_events": events})
     except SessionError as error:
         size = sum(file.stat().st_size for file in files if file.is_file())
         unfinished = any(file.name.endswith(PARTIAL_SUFFIX) for file in files)
         what = "recording" if any(map(is_growing, files)) else "unfinished" if unfinished else "unreadable"
-        parts = len(files) if list(files) != [path] else 0
         why = str(error).removeprefix(f"{path}: ") if what != "recording" else "`flowrec view --live` shows it"
         return ListedSession(name, what, why, size, parts=parts), error
     return row, session
@@ -144,9 +136,10 @@ def _select_rows(rows: dict[Path, ListedSession], where: str, sort: str) -> list
         raise UsageError(unknown_name("--sort", key, names))
     numbers = _fulfilling(facts, names, where) if where else list(range(len(facts)))
     if key:
+        # Unknown values and NaN, which is not itself, come last.
         known = [k for k in numbers if (value := facts[k].get(key)) is not None and value == value]
         known.sort(key=lambda k: facts[k][key], reverse=sort.startswith("-"))
-        numbers = known + [k for k in numbers if k not in set(known)]
+        numbers = [*dict.fromkeys((*known, *numbers))]
     listed = list(rows.values())
     return [listed[k] for k in numbers]
 

@@ -18,9 +18,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import AxesVerdict, ChipError, FlowField, nanoseconds
+from flowrec.core import AxesVerdict, ChipError, Floats, FlowField, nanoseconds
 from flowrec.measure import ImageVerdict, sampled_s
 from flowrec.physics import Calibration, Chip, Orientation, nearest, sample
 from flowrec.stages import (
@@ -40,8 +39,6 @@ _LEAST_WINDOWS = 4
 _HIDES_PX = 0.5  # root mean square from which on shake hides the commands; 1 px at 3 Hz does in simulated movies
 _STILL = 0.15  # of the speed that the log drives
 _CARRIED = 0.8  # share of the motion that the flow explains, from which on the body is not driven
-
-Floats = NDArray[np.float64]
 
 
 def why_unexplained(seen: MovieTracks, flow: FlowField, um_per_rev: float) -> str:
@@ -68,10 +65,9 @@ def why_unexplained(seen: MovieTracks, flow: FlowField, um_per_rev: float) -> st
             "the tracked body goes where the assumed flow carries it, so it is another particle, which is not driven; "
             "name the robot with --robot"
         )
-    speed = math.sqrt(float((velocity**2).sum(1).mean()))
     return (
-        f"the tracked body moves by itself, at {speed:.0f} um/s, but not when and where this log says: it is the log "
-        "of another run"
+        f"the tracked body moves by itself, at {_speed(velocity):.0f} um/s, but not when and where this log says: "
+        "it is the log of another run"
     )
 
 
@@ -82,7 +78,7 @@ def why_still(seen: MovieTracks, um_per_rev: float) -> str:
     turning = log.frequency_hz[(log.amplitude_mt > 0.0) & (log.frequency_hz > 0.0)]
     if len(velocity) < _LEAST_WINDOWS or not turning.size:
         return ""
-    speed, driven = math.sqrt(float((velocity**2).sum(1).mean())), um_per_rev * float(np.median(turning))
+    speed, driven = _speed(velocity), um_per_rev * float(np.median(turning))
     if speed >= _STILL * driven:
         return ""
     return (
@@ -124,6 +120,11 @@ def _velocities(time_s: Floats, positions_um: Floats) -> tuple[Floats, Floats]:
     whole = (span_s > 0.5 * _WINDOW_S) & (span_s < 2.0 * _WINDOW_S)
     velocity = np.diff(positions_um[ends], axis=0)[whole] / span_s[whole, None]
     return 0.5 * (time_s[ends[1:]] + time_s[ends[:-1]])[whole], velocity
+
+
+def _speed(velocity: Floats) -> float:
+    """Root mean square of velocities (m, 2)."""
+    return math.sqrt(float((velocity**2).sum(1).mean()))
 
 
 def _carried_share(middle_s: Floats, velocity: Floats, seen: MovieTracks, flow: FlowField) -> float:

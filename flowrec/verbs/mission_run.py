@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flowrec.console import RunEnded, refuse_without_packages
 from flowrec.core import (
@@ -63,6 +64,9 @@ from flowrec.verbs.preparation import (
 from flowrec.verbs.run_summary import GOOD_ENDS, Recorded, figures_of, files_text, judge_refinement, judges_of
 from flowrec.verbs.watching import Watching
 
+if TYPE_CHECKING:
+    from flowrec.verbs.first_pass import Looked
+
 # Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
 CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
 VIEW_TIMEOUT_S = 0.2  # for a viewer to show the last messages
@@ -77,11 +81,8 @@ def run_mission(
     overwrite: bool = False,
     control: Unattended | None = None,
     inputs: Sequence[Path] = (),
-    keep_failed: bool = True,
-    given_facts: Mapping[str, str] | None = None,
     console: bool = False,
-    known: Prepared | None = None,
-    given_doubts: Sequence[str] = (),
+    looked: Looked | None = None,
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
@@ -94,11 +95,9 @@ def run_mission(
         other time.
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
     inputs : files that were read besides those that `config` names; no output may be one of them.
-    keep_failed : False: a run that ends by an exception leaves no file, and one that it was to replace stays.
-    given_facts : more for the provenance in the head of the file.
     console : serve a page on this machine that shows the run and steers it.
-    known : see `prepare`.
-    given_doubts : why the result is doubtful, besides what the run shows.
+    looked : of an import, what the movie has shown before. It can be done again: one that ends by an exception leaves
+        no file, and one that it was to replace stays.
 
     Raises
     ------
@@ -109,22 +108,21 @@ def run_mission(
     inputs = (*inputs, *files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         Output(out, MCAP, inputs, overwrite).check()
-    prepared = prepare(config, known=known)
+    prepared = prepare(config, known=looked.prepared if looked is not None else None)
     resolved = prepared.config
     realtime = realtime or "realtime" in RIGS[resolved.rig].needs
     timeout_s = guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
     output = Output(place_of_session(resolved, out, overwrite), MCAP, inputs, overwrite)
     if view == "rrd":
         Output(output.path.with_suffix(RRD[0]), RRD, inputs, overwrite).check()
-    source = {**prepared.facts, **(given_facts or {})}
-    mission = _Mission(prepared, output, source, realtime, timeout_s, control or Unattended())
+    mission = _Mission(prepared, output, looked, realtime, timeout_s, control or Unattended())
     with ExitStack() as stack:
         # From the first byte of the file to the last, every way to end the run leaves a complete file.
         mission.connect(stack)
-        mission.open_file(stack, keep_failed)
+        mission.open_file(stack)
         watching = stack.enter_context(mission.watching(view, console))
         mission.fly(watching.sinks)
-        ended = mission.close_file(given_doubts)
+        ended = mission.close_file()
         watching.close(ended, VIEW_TIMEOUT_S if mission.run_control.reason else None)
     recorded = mission.result()
     if view == "rrd":
@@ -145,7 +143,7 @@ class _Mission:
         self,
         prepared: Prepared,
         output: Output,
-        source: dict[str, str],
+        looked: Looked | None,
         realtime: bool,
         timeout_s: float | None,
         control: Unattended,
@@ -154,13 +152,14 @@ class _Mission:
 
         Parameters
         ----------
-        source : facts for the head of the file.
+        looked, realtime : as of `run_mission`.
         timeout_s : of the watchdog; None: it has no timer.
         """
         config, pipeline = prepared.config, prepared.pipeline
         self._prepared, self._config, self._chip, self._pipeline = prepared, config, prepared.chip, pipeline
         self._output, self._folder = output, output.path.resolve().parent
-        self._source, self._realtime, self._control = source, realtime, control
+        self._looked, self._realtime, self._control = looked, realtime, control
+        self._source = {**prepared.facts, **(looked.facts if looked is not None else {})}  # for the head of the file
         self.run_control = control.run_control
         self._fields = field_of_session(Path(config.start.field), self._chip) if config.start.field else {}
         self._rig: Rig = RIGS[config.rig].load().of(pipeline, config, config.duration_s, realtime)
@@ -198,7 +197,7 @@ class _Mission:
             self._source |= admit(rig, worker, scene, self._fields, self._folder, self.run_control)
         self._worker = Preloaded(worker, self._fields) if self._fields else worker
 
-    def open_file(self, stack: ExitStack, keep_failed: bool) -> None:
+    def open_file(self, stack: ExitStack) -> None:
         """Open the file, and watch the disk that it is on."""
         self._writer = writer = stack.enter_context(
             session_writer(
@@ -209,7 +208,7 @@ class _Mission:
                 in_pieces=True,
                 derived=self._prepared.derived,
                 facts=self._source,
-                keep_failed=keep_failed,
+                keep_failed=self._looked is None,
             )
         )
         self._opened.append(writer)
@@ -263,7 +262,7 @@ class _Mission:
             granted = {"loop_priority": first, "writer_priority": writes_first}
             self._priorities = {name: "real time" if each else "ordinary" for name, each in granted.items()}
 
-    def _figures(self, given_doubts: Sequence[str]) -> Figures:
+    def _figures(self) -> Figures:
         """Figures of the run, with the reasons to doubt it."""
         config, rig, walls, report = self._config, self._rig, self._prepared.walls, self._report
         facts = figures_of(self._chip, report, self._statistics.true_field)
@@ -282,14 +281,16 @@ class _Mission:
             self._covered = self.run_control.with_stop(Coverage(rig.taken, rig.images, "images"))
             facts["covered"] = self._covered.amount
         doubted += [doubt for judge in self._judges for doubt in judge.doubts()]
-        if doubts := doubts_text([*given_doubts, *doubted]):
+        if self._looked is not None:
+            doubted = [*self._looked.doubts, *doubted]
+        if doubts := doubts_text(doubted):
             facts[DOUBTS] = doubts
         return facts
 
-    def close_file(self, given_doubts: Sequence[str]) -> RunEnded:
+    def close_file(self) -> RunEnded:
         """Close the file with its outcome; soon, if the run was stopped."""
         writer, report = self._writer, self._report
-        self._facts = self._figures(given_doubts)
+        self._facts = self._figures()
         outcome = as_text(self._facts) | self._clocks.outcome() | self._priorities
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
         writer.close(outcome, CLOSE_TIMEOUT_S if self.run_control.reason else None, why=bad)

@@ -1,7 +1,8 @@
-"""Options that several verbs have, and how the help lists commands."""
+"""Options that several verbs have, what a report needs, and how the help lists commands."""
 
 from __future__ import annotations
 
+import importlib.util
 import pkgutil
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Union
 import typer
 from typer.core import TyperGroup
 
-from flowrec.core import stopped_in_one_line
+from flowrec.core import UsageError, stopped_in_one_line
 from flowrec.store import session_path
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ SessionFile = Annotated[
 _SET = typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb.")
 Sets = Annotated[list[str] | Mapping[str, Any] | None, _SET]
 SetTexts = Annotated[list[str] | None, _SET]
+SessionOut = Annotated[
+    Path | str | None, typer.Option("--out", "-o", help="Session file; by default named by date and sample.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
@@ -58,6 +62,8 @@ HELP_SETTINGS: dict[str, Any] = {  # of an app of typer
     "pretty_exceptions_enable": False,
     "rich_markup_mode": None,  # frames around the help would take as long to draw as all the rest
 }
+HTML = (".html", ".htm")
+_PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
 _LONGEST_DESCRIPTION = 1000  # characters: longer than any
 
 
@@ -116,6 +122,13 @@ class Stoppable:
     def invoke(self, ctx: Any) -> Any:
         with stopped_in_one_line():
             return super().invoke(ctx)  # type: ignore[misc]
+
+
+def require_packages() -> None:
+    """Raise UsageError where a package of the extra `report` is not installed."""
+    for module, package in _PACKAGES.items():
+        if importlib.util.find_spec(module) is None:
+            raise UsageError(f"a report needs {package}, which is not installed: pip install 'flowrec[report]'")
 
 
 def from_above(name: str) -> Any:

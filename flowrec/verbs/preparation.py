@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from flowrec.core import (
     say,
     warn,
 )
-from flowrec.measure import ImageVerdict, orientation_by_image
+from flowrec.measure import ImageVerdict, WallsState, orientation_by_image, walls_state
 from flowrec.physics import Chip, load_chip, median_width_um
 from flowrec.rigs import fitted_to_movie, open_source
 from flowrec.run import refuse_below
@@ -42,10 +42,6 @@ from flowrec.stages import (
 )
 from flowrec.store import Session, files_behind, run_files, run_path, runs_in
 from flowrec.verbs.auto_recovery import recover_leftovers
-
-if TYPE_CHECKING:
-    from flowrec.measure import WallsState
-
 
 _LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
 UNCHECKED = "; mission.check_axes = false records without this check"
@@ -135,8 +131,6 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
 
 def _looked_at(config: ResolvedConfig, chip: Chip) -> tuple[ImageVerdict | None, WallsState | None]:
     """Verdict of a movie on the axes, and that of its walls on the registration."""
-    from flowrec.measure import walls_state
-
     try:
         with open_source(config.movie) as movie:
             image = movie.median_image()
@@ -231,18 +225,17 @@ def place_of_session(config: Config, out: Path | None, overwrite: bool) -> Path:
     return path
 
 
-def default_path(config: Config, folder: Path | None = None) -> Path:
-    """The path date_operator_sample_number.mcap with the first free number."""
+def default_path(config: Config) -> Path:
+    """The path date_operator_sample_number.mcap with the first free number, in this folder."""
     sample = config.recording.sample or Path(config.chip.path).stem or config.chip.name
     words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
     stem = "_".join(word.replace(" ", "-") for word in words if word)
-    folder = folder or Path()
-    names = runs_in(folder)
+    names = runs_in(Path())
     for number in range(1, 10_000):
-        path = folder / f"{stem}_{number:03d}.mcap"
+        path = Path(f"{stem}_{number:03d}.mcap")
         if path not in names:
             return path
-    raise SessionError(f"{folder}: 9999 sessions named {stem} are here; name one with --out")
+    raise SessionError(f".: 9999 sessions named {stem} are here; name one with --out")
 
 
 def guard_timeout_s(config: ResolvedConfig) -> float:

@@ -8,7 +8,7 @@ import typer
 
 from flowrec.core import View
 from flowrec.verbs.command import MisuseError, Told, verb
-from flowrec.verbs.options import AS_THE_COMMAND, ATTENDED, AsConfig, Asked, Overwrite, Sets, readable_toml
+from flowrec.verbs.options import AS_THE_COMMAND, ATTENDED, AsConfig, Asked, Overwrite, SessionOut, Sets, readable_toml
 
 if TYPE_CHECKING:
     from flowrec.stages import Config, ResolvedConfig
@@ -61,9 +61,7 @@ def record(
     config: Annotated[
         AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML); --dry-run prints one.")
     ] = None,
-    out: Annotated[
-        Path | str | None, typer.Option("--out", "-o", help="Session file; by default named by date and sample.")
-    ] = None,
+    out: SessionOut = None,
     view: Annotated[View, typer.Option(help="Watch live (spawn, serve) or write an .rrd at the end.")] = "none",
     realtime: Annotated[bool, typer.Option("--realtime", help="Run the simulated rig in real time.")] = False,
     overwrite: Overwrite = False,

@@ -12,7 +12,7 @@ from flowrec.verbs.options import AS_THE_COMMAND, ATTENDED, Asked, Overwrite, Se
 if TYPE_CHECKING:
     from flowrec.verbs.interactive import Unattended
     from flowrec.verbs.replay_change import Change
-    from flowrec.verbs.replay_made import Replay
+    from flowrec.verbs.replay_result import Replay
 
 DEFAULT_REFINE = "pi_unet"
 
@@ -110,12 +110,12 @@ def replay(
         from flowrec.store import existing_session
 
         existing_session(session)  # before imports that take a second
-    from flowrec.verbs.replay_made import Replay, make_replay
+    from flowrec.verbs.replay_made import make_replay
 
     if jobs != 1:
         from flowrec.verbs.replay_segments import verify as verify_in_segments
 
-        return Replay.of(verify_in_segments(session, jobs, from_s, control), None)
+        return verify_in_segments(session, jobs, from_s, control)
     return make_replay(
         session,
         change,

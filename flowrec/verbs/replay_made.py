@@ -1,140 +1,35 @@
-"""Products of `flowrec replay`: a session, its tables, a list of changes, and flights of both plans."""
+"""Files of `flowrec replay`, and flights of both plans."""
 
 from __future__ import annotations
 
-import html
-import math
 import shutil
 import tempfile
 import weakref
-from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import fields, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from flowrec.core import (
     FLOW_FIELDS,
     MCAP,
     RRD,
-    FlowField,
     Output,
     Phase,
     Row,
     SessionError,
     UsageError,
-    comparison_for_people,
     progress,
     say,
     seconds,
-    table,
-    warn,
 )
 from flowrec.rigs import SimulatedRig
-from flowrec.run import LockstepWorker, Preloaded, ReplayPair, RunControl, RunReport, Sink, before_after, run
+from flowrec.run import LockstepWorker, Preloaded, RunControl, RunReport, Sink, run
 from flowrec.stages import assemble, facts_of, other_packages
 from flowrec.store import Session, files_behind, named_beside, session_writer
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.replay_change import Change
-from flowrec.verbs.replay_result import Replayed
+from flowrec.verbs.replay_result import Replay
 from flowrec.verbs.session_replay import planned_from, replay_session
-
-if TYPE_CHECKING:
-    import pandas
-    import pyarrow as pa
-
-
-_SAME_MAP = 1e-3  # of the largest speed: smaller changes are not visible in any table
-
-
-class BeforeAfter(tuple[Row, ...]):
-    """Rows of key, recorded and replayed value; the keys carry the unit. As text and in a notebook it is a table."""
-
-    __slots__ = ()
-
-    def to_pandas(self) -> pandas.DataFrame:
-        """The columns recorded and replayed, a row a key; UsageError if pandas is not installed."""
-        try:
-            import pandas
-        except ModuleNotFoundError as error:
-            raise UsageError("to_pandas needs pandas, which is not installed: pip install 'flowrec[export]'") from error
-        columns = {"recorded": [row[1] for row in self], "replayed": [row[2] for row in self]}
-        return pandas.DataFrame(columns, index=pandas.Index([row[0] for row in self], name="quantity"), dtype=object)
-
-    def __str__(self) -> str:
-        shown = [("", "recorded", "replayed"), *comparison_for_people(self)]
-        widths = [max(len(row[column]) for row in shown) for column in range(3)]
-        return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}" for a, b, c in shown)
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-            for row in comparison_for_people(self)
-        )
-        return f"<table><tr><th></th><th>recorded</th><th>replayed</th></tr>{rows}</table>"
-
-
-class Replay(Replayed):
-    """A `Replayed`, with all messages of the replay.
-
-    Attributes
-    ----------
-    file : the session of the replay; None if none was written.
-    result : the same, open, without images unless they were asked for. Without `out` it is a temporary file, which goes
-        when this object goes.
-    before_after : what the replay changed: errors, routes, times, commands; and how both plans were flown.
-    """
-
-    file: Path | None
-    _reflown: list[Row]
-
-    @classmethod
-    def of(cls, done: Replayed, file: Path | None, reflown: Sequence[Row] = ()) -> Replay:
-        """A finished replay, its file, and rows about the flights of both plans."""
-        made = cls(**{each.name: getattr(done, each.name) for each in fields(Replayed)})
-        made.file, made._reflown = file, list(reflown)
-        return made
-
-    @cached_property
-    def result(self) -> Session:
-        if self.file is None:
-            raise UsageError("this verification wrote no session: it only compares")
-        return Session(self.file)
-
-    def table(self, topic: str) -> pa.Table:
-        """All messages of one topic of the replay, as `Session.table`."""
-        return self.result.table(topic)
-
-    @cached_property
-    def before_after(self) -> BeforeAfter:
-        return BeforeAfter([*before_after(self), *self._reflown])
-
-    @property
-    def _remarks(self) -> list[str]:
-        return [*self.packages, *refinement_remarks(self)]
-
-    def changes_as_json(self) -> dict[str, Any]:
-        """Changes of the replay, for JSON."""
-        report = self.report
-        figures = {"wall_s": report.wall_s, "duration_s": report.duration_s, "ticks": report.ticks}
-        rows = [dict(zip(("quantity", "recorded", "replayed"), row, strict=True)) for row in self.before_after]
-        doubts = {"doubts": "; ".join(self.doubts)} if self.doubts else {}
-        return {"refinement": self._remarks, "rows": rows} | figures | {"covered": self.covered.as_json()} | doubts
-
-    def show_changes(self, name: str) -> None:
-        """Print what the replay changed, and what is doubtful of it."""
-        report = self.report
-        table(f"Replay of {name}", ("", "recorded", "replayed"), comparison_for_people(self.before_after))
-        length = f"({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s"
-        of_these = "; the figures are of those" if self.covered.stopped else ""
-        say(f"{self.covered.text} {length}{of_these} -> {self.file}")
-        for line in self._remarks:
-            say(line)
-        for doubt in self.doubts:
-            warn(f"doubtful: {doubt}")
 
 
 def make_replay(
@@ -157,7 +52,7 @@ def make_replay(
     """
     session = Session.of(session)
     if verify and numbered and out is None:
-        return Replay.of(replay_session(session, change, from_s, verify=True, control=control), None)
+        return replay_session(session, change, from_s, verify=True, control=control)
     with ExitStack() as stack:  # holds the temporary folder, until the object that is returned goes
         if out is None and numbered:
             out = _with_numbers(session.path)
@@ -171,9 +66,10 @@ def make_replay(
         for output, wanted in ((file, True), (flight, fly), (picture, rrd)):
             if wanted:
                 output.check()
-        done = replay_session(session, change, from_s, verify, out, overwrite, frames, control)
-        whole = not done.covered.stopped
-        made = Replay.of(done, out, refly(done, flight) if fly and whole else ())
+        made = replay_session(session, change, from_s, verify, out, overwrite, frames, control)
+        whole = not made.covered.stopped
+        if fly and whole:
+            made.reflown = refly(made, flight)
         if rrd and whole:
             from flowrec.exports import export  # late: it imports Rerun
 
@@ -191,24 +87,7 @@ def _with_numbers(path: Path) -> Path:
     return out
 
 
-def refinement_remarks(done: ReplayPair) -> list[str]:
-    """Lines about the refinement of a replay; why, if it left the recorded map unchanged."""
-    was, now = done.recorded.refined, done.replayed.refined
-    if now is None:
-        return []
-    lines = [f"{now.method}: {now.note}"] if now.note else []
-    if was is None or now is was or _largest_change(was, now) > _SAME_MAP:
-        return lines
-    why = ""
-    if now.method == "pi_unet" and done.config.refine.pi_unet.start == "assimilate":
-        why = (
-            ": pi_unet begins with the assimilated map and keeps it where it explains the observations; with "
-            "--set refine.pi_unet.start=fvm it begins with the assumed flow, as in the paper"
-        )
-    return [*lines, f"the refined map is the recorded one, unchanged{why}"]
-
-
-def refly(done: Replayed, out: Output | None) -> list[Row]:
+def refly(done: Replay, out: Output | None) -> list[Row]:
     """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
 
     Both flights begin where the recorded route does and have the same seed; rows as of `before_after`. They go straight
@@ -241,7 +120,7 @@ def refly(done: Replayed, out: Output | None) -> list[Row]:
     ]
 
 
-def _fly_plan(done: Replayed, name: str, start_um: tuple[float, float], out: Output | None) -> RunReport:
+def _fly_plan(done: Replay, name: str, start_um: tuple[float, float], out: Output | None) -> RunReport:
     """The flight of the "recorded" or the "replayed" plan, written to `out` if it is given."""
     session, last = done.session, done.recorded.mission
     config, tick = (session.config, done.recorded) if name == "recorded" else (done.config, done.replayed)
@@ -275,12 +154,6 @@ def _fly_plan(done: Replayed, name: str, start_um: tuple[float, float], out: Out
         if out is not None:
             writer.close({"outcome": flight.outcome, "note": f"refly of {session.path.name}"})
     return flight
-
-
-def _largest_change(was: FlowField, now: FlowField) -> float:
-    """Largest change of a velocity component relative to the largest component."""
-    largest = float(np.abs(was.velocity_um_s).max())
-    return float(np.abs(now.velocity_um_s - was.velocity_um_s).max()) / largest if largest else math.inf
 
 
 def _navigation_s(flight: RunReport) -> float | None:

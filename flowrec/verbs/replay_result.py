@@ -1,18 +1,44 @@
-"""The result of a replay: its comparison with the recording and, for `--verify`, worker results and file digests."""
+"""The result of a replay: its messages, its comparison with the recording, what it changed; worker, digests."""
 
 from __future__ import annotations
 
+import html
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from flowrec.core import ANSWERED_BY, BY_FIELD, WORKER_FIELDS, Coverage, FlowField, Mission, Tick, WorkOrder, printable
-from flowrec.run import CommandDifference, RunControl, RunReport, work
+import numpy as np
+
+from flowrec.core import (
+    ANSWERED_BY,
+    BY_FIELD,
+    WORKER_FIELDS,
+    Coverage,
+    FlowField,
+    Mission,
+    Row,
+    Tick,
+    UsageError,
+    WorkOrder,
+    comparison_for_people,
+    printable,
+    say,
+    table,
+    warn,
+)
+from flowrec.run import CommandDifference, ReplayPair, RunControl, RunReport, before_after, work
 from flowrec.stages import Pipeline, ResolvedConfig
 from flowrec.store import Session, digest_faults
 from flowrec.verbs.comparison import Comparison
 
+if TYPE_CHECKING:
+    import pandas
+    import pyarrow as pa
+
+_SAME_MAP = 1e-3  # of the largest speed: smaller changes are not visible in any table
 CONSISTENT = "head and messages: consistent with their digest, unsigned: whoever can edit the file can edit both"
 
 
@@ -119,9 +145,36 @@ def digest_lines(path: Path) -> tuple[bool, list[str]]:
     return intact, lines or [CONSISTENT]
 
 
-@dataclass(slots=True)
-class Replayed:
-    """The result of a replay.
+class BeforeAfter(tuple[Row, ...]):
+    """Rows of key, recorded and replayed value; the keys carry the unit. As text and in a notebook it is a table."""
+
+    __slots__ = ()
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The columns recorded and replayed, a row a key; UsageError if pandas is not installed."""
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            raise UsageError("to_pandas needs pandas, which is not installed: pip install 'flowrec[export]'") from error
+        columns = {"recorded": [row[1] for row in self], "replayed": [row[2] for row in self]}
+        return pandas.DataFrame(columns, index=pandas.Index([row[0] for row in self], name="quantity"), dtype=object)
+
+    def __str__(self) -> str:
+        shown = [("", "recorded", "replayed"), *comparison_for_people(self)]
+        widths = [max(len(row[column]) for row in shown) for column in range(3)]
+        return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}" for a, b, c in shown)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+            for row in comparison_for_people(self)
+        )
+        return f"<table><tr><th></th><th>recorded</th><th>replayed</th></tr>{rows}</table>"
+
+
+@dataclass
+class Replay:
+    """A replay: its comparison with the recording, and all of its messages.
 
     Attributes
     ----------
@@ -137,6 +190,11 @@ class Replayed:
     digest : of --verify: whether the files match their digests, and lines of text about it; None: they were not read.
     doubts : why what was written is doubtful; none if it is not, or nothing was written.
     packages : where a stage is by another version of a package of others, or by other code of it, than recorded.
+    file : the session of the replay; None if none was written.
+    reflown : rows about the flights of both plans.
+    result : `file`, open, without images unless they were asked for. Without `out` it is a temporary file, which goes
+        when this object goes.
+    before_after : what the replay changed: errors, routes, times, commands; and how both plans were flown.
     """
 
     session: Session
@@ -152,6 +210,46 @@ class Replayed:
     digest: tuple[bool, list[str]] | None = None
     doubts: list[str] = field(default_factory=list)
     packages: list[str] = field(default_factory=list)
+    file: Path | None = None
+    reflown: list[Row] = field(default_factory=list)
+
+    @cached_property
+    def result(self) -> Session:
+        if self.file is None:
+            raise UsageError("this verification wrote no session: it only compares")
+        return Session(self.file)
+
+    def table(self, topic: str) -> pa.Table:
+        """All messages of one topic of the replay, as `Session.table`."""
+        return self.result.table(topic)
+
+    @cached_property
+    def before_after(self) -> BeforeAfter:
+        return BeforeAfter([*before_after(self), *self.reflown])
+
+    @property
+    def _remarks(self) -> list[str]:
+        return [*self.packages, *refinement_remarks(self)]
+
+    def changes_as_json(self) -> dict[str, Any]:
+        """Changes of the replay, for JSON."""
+        report = self.report
+        figures = {"wall_s": report.wall_s, "duration_s": report.duration_s, "ticks": report.ticks}
+        rows = [dict(zip(("quantity", "recorded", "replayed"), row, strict=True)) for row in self.before_after]
+        doubts = {"doubts": "; ".join(self.doubts)} if self.doubts else {}
+        return {"refinement": self._remarks, "rows": rows} | figures | {"covered": self.covered.as_json()} | doubts
+
+    def show_changes(self, name: str) -> None:
+        """Print what the replay changed, and what is doubtful of it."""
+        report = self.report
+        table(f"Replay of {name}", ("", "recorded", "replayed"), comparison_for_people(self.before_after))
+        length = f"({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s"
+        of_these = "; the figures are of those" if self.covered.stopped else ""
+        say(f"{self.covered.text} {length}{of_these} -> {self.file}")
+        for line in self._remarks:
+            say(line)
+        for doubt in self.doubts:
+            warn(f"doubtful: {doubt}")
 
     @property
     def same(self) -> bool | None:
@@ -243,6 +341,29 @@ class Replayed:
             "digest_faults": None if self.digest is None else [] if self.digest[0] else self.digest[1],
             "lines": self.lines(),
         }
+
+
+def refinement_remarks(done: ReplayPair) -> list[str]:
+    """Lines about the refinement of a replay; why, if it left the recorded map unchanged."""
+    was, now = done.recorded.refined, done.replayed.refined
+    if now is None:
+        return []
+    lines = [f"{now.method}: {now.note}"] if now.note else []
+    if was is None or now is was or _largest_change(was, now) > _SAME_MAP:
+        return lines
+    why = ""
+    if now.method == "pi_unet" and done.config.refine.pi_unet.start == "assimilate":
+        why = (
+            ": pi_unet begins with the assimilated map and keeps it where it explains the observations; with "
+            "--set refine.pi_unet.start=fvm it begins with the assumed flow, as in the paper"
+        )
+    return [*lines, f"the refined map is the recorded one, unchanged{why}"]
+
+
+def _largest_change(was: FlowField, now: FlowField) -> float:
+    """Largest change of a velocity component relative to the largest component."""
+    largest = float(np.abs(was.velocity_um_s).max())
+    return float(np.abs(now.velocity_um_s - was.velocity_um_s).max()) / largest if largest else math.inf
 
 
 def coverage_of(

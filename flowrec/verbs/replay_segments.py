@@ -21,7 +21,7 @@ from flowrec.stages import other_packages
 from flowrec.store import Session
 from flowrec.verbs.comparison import Comparison, Side
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.replay_result import Replayed, WorkerResults, coverage_of, digest_lines
+from flowrec.verbs.replay_result import Replay, WorkerResults, coverage_of, digest_lines
 from flowrec.verbs.session_replay import replay_session
 
 _TICKS = 300  # of a segment at least: restoring its start takes as long as a few of them
@@ -44,7 +44,7 @@ class _Verified(NamedTuple):
 
 def verify(
     session: Session | Path | str, jobs: int = 1, from_s: float | None = None, control: Unattended | None = None
-) -> Replayed:
+) -> Replay:
     """Replay a session as it was recorded, in `jobs` processes, and compare every message.
 
     Parameters
@@ -97,7 +97,7 @@ def verify(
         comparison.followed_by(each.comparison)
         worker.followed_by(each.worker)
     report = replace(found[-1].report if found else RunReport(), ticks=comparison.ticks, duration_s=session.duration_s)
-    return Replayed(
+    return Replay(
         session,
         session.config,
         report,

@@ -8,7 +8,7 @@ import typer
 
 from flowrec.core import UsageError
 from flowrec.verbs.command import Told, verb
-from flowrec.verbs.options import AnySession, Asked, Overwrite, SessionFile, from_above
+from flowrec.verbs.options import AnySession, Asked, Overwrite, SessionFile, from_above, require_packages
 
 
 def _report_told(asked: Asked, page: Path) -> Told:
@@ -54,6 +54,7 @@ def report(
             raise UsageError(f"{session}: the page of a sweep goes without replays and --figures")
         page: Path = from_above("report_sweep")(Path(session), None if out is None else Path(out), overwrite)
         return page
+    require_packages()
     from flowrec.verbs.report_page import write_report
 
     return write_report(session, replays or (), out, figures, overwrite)

@@ -1,15 +1,18 @@
-"""Report of a session and of its replays, as one HTML page and as figures for a paper: flowrec report."""
+"""Report of a session and of its replays, as one HTML page and as figures for a paper: flowrec report.
+
+Needs the packages of the extra `report`: see `require_packages`.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flowrec.core import (
     DOUBTS,
+    FlowField,
     Level,
     Outcome,
     Output,
@@ -22,21 +25,41 @@ from flowrec.core import (
     say,
     text_of_figure,
 )
+from flowrec.exports import (
+    GLOSSARY,
+    MEANINGS,
+    ChangeFigure,
+    Folded,
+    MapFigure,
+    MotionFigure,
+    ObserverFigure,
+    Page,
+    PathFigure,
+    PathFlowFigure,
+    RecordingFigure,
+    ReplayPart,
+    ReportData,
+    ReportFigure,
+    ReportTable,
+    Span,
+    TimelineFigure,
+    draw_figure,
+    numbered_actions,
+    render,
+    sentence,
+    style,
+)
 from flowrec.run import ReplayFiles, before_after
 from flowrec.stages import flow_error
 from flowrec.store import Session, files_behind, input_blamed, named_beside, session_sha256, toml_table
 from flowrec.verbs.check import check
 from flowrec.verbs.info import facts_for_people, info
+from flowrec.verbs.options import HTML
 from flowrec.verbs.replay_change import OF_EVERY_REPLAY
-from flowrec.verbs.replay_made import refinement_remarks
+from flowrec.verbs.replay_result import refinement_remarks
 from flowrec.verbs.session_parts import flat
 from flowrec.verbs.verdict import Verdict
 
-if TYPE_CHECKING:
-    from flowrec.exports import Page, ReplayPart, ReportData, ReportFigure, ReportTable
-
-HTML = (".html", ".htm")
-_PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
 _HIDDEN = frozenset(  # of the outcome: shown elsewhere
     {
         "outcome",
@@ -65,9 +88,6 @@ def write_report(
     overwrite: bool,
 ) -> Path:
     """Write the report of a session; arguments and errors as of `flowrec.report`."""
-    require_packages()
-    from flowrec.exports import ReportData, render, style
-
     session = Session.of(session)
     parts = [Session.of(each) for each in replays]
     path = session.path
@@ -106,13 +126,6 @@ def write_report(
     return output.path
 
 
-def require_packages() -> None:
-    """Raise UsageError where a package of the extra `report` is not installed."""
-    for module, package in _PACKAGES.items():
-        if importlib.util.find_spec(module) is None:
-            raise UsageError(f"a report needs {package}, which is not installed: pip install 'flowrec[report]'")
-
-
 def _check_parents(session: Session, replays: Sequence[Session]) -> None:
     """Refuse a file that is no replay of this session."""
     sha256 = session_sha256([file.path for file in session.run.files]) if replays else ""
@@ -127,18 +140,6 @@ def _check_parents(session: Session, replays: Sequence[Session]) -> None:
 
 
 def _figures(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles]) -> list[ReportFigure]:
-    from flowrec.exports import (
-        ChangeFigure,
-        MapFigure,
-        MotionFigure,
-        ObserverFigure,
-        PathFigure,
-        PathFlowFigure,
-        RecordingFigure,
-        Span,
-        TimelineFigure,
-    )
-
     first_s = data.history.first_s
     gaps = [Span("no image", first_s + gap.at_s, first_s + gap.at_s + gap.length_s) for gap in verdict.gaps]
     changes = [ChangeFigure(pair.recorded.field, pair.replayed.field, n) for n, pair in enumerate(pairs, 1)]
@@ -156,8 +157,6 @@ def _figures(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles]) -
 
 def _files(kinds: Sequence[ReportFigure], data: ReportData) -> Iterator[tuple[str, bytes]]:
     """Name and content of each figure's files."""
-    from flowrec.exports import style
-
     for kind in kinds:
         if kind.why_not(data):
             continue
@@ -169,8 +168,6 @@ def _files(kinds: Sequence[ReportFigure], data: ReportData) -> Iterator[tuple[st
 
 
 def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: Sequence[ReportFigure]) -> Page:
-    from flowrec.exports import GLOSSARY, Folded, Page, ReportTable, draw_figure, sentence
-
     session = data.session
     facts = info(session)
     outcome = str(facts["outcome"])
@@ -220,31 +217,31 @@ def _sentence(text: str) -> str:
 def _about(facts: dict[str, Any], session: Session) -> str:
     """Time, place and equipment of the run, in one line."""
     rig = {"simulated": "in simulation", "movie": "from a movie", "lab": "in the laboratory"}
-    parts = [f"recorded {str(facts['recorded'])[:16].replace('T', ' ')} UTC"]
-    if facts["replay_of"]:
-        parts[0] = f"replay of {facts['replay_of']}, made {str(facts['recorded'])[:16].replace('T', ' ')} UTC"
-    parts += [rig.get(str(facts["rig"]), f"rig {facts['rig']}"), f"chip {facts['chip']}"]
-    parts.append(f"{session.duration_s:.1f} s")
-    for key in ("operator", "sample"):
-        if facts.get(key):
-            parts.append(f"{key}: {facts[key]}")
-    return ", ".join(parts)
+    when = f"{str(facts['recorded'])[:16].replace('T', ' ')} UTC"
+    made = f"replay of {facts['replay_of']}, made {when}" if facts["replay_of"] else f"recorded {when}"
+    where = rig.get(str(facts["rig"]), f"rig {facts['rig']}")
+    named = (f"{key}: {facts[key]}" for key in ("operator", "sample") if facts.get(key))
+    return ", ".join([made, where, f"chip {facts['chip']}", f"{session.duration_s:.1f} s", *named])
+
+
+def _maps(data: ReportData) -> dict[str, FlowField]:
+    """The flow maps that the session holds."""
+    named = {"assumed": data.assumed, "refined": data.refined}
+    return {name: field for name, field in named.items() if field is not None}
 
 
 def _key_figures(data: ReportData) -> ReportTable:
-    from flowrec.exports import MEANINGS, ReportTable
-
     session = data.session
     figures = {"duration_s": session.duration_s} | {
         key: value for key, value in session.outcome.items() if key not in _HIDDEN and value not in (None, "")
     }
-    for name, field in (("assumed", data.assumed), ("refined", data.refined)):
+    for name, field in _maps(data).items():
         error = flow_error(data.scene.chip, field, data.truth)
         if error is not None:  # of a run that was cut off, its last tick instead of its figures
             figures.setdefault(f"{name}_flow_error", error)
     rows = [(name_of(key), _micro(text_of_figure(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
-    for name, field in (("assumed", data.assumed), ("refined", data.refined)):
-        if field is not None and field.error_share is not None:
+    for name, field in _maps(data).items():
+        if field.error_share is not None:
             text = text_of_figure("_error", field.error_share)
             rows.append((f"{name} flow, stated error", text, f"what the {name} map expects its error to be"))
     if data.truth is None:
@@ -259,10 +256,7 @@ def _micro(text: str) -> str:
 
 def _boundary(data: ReportData) -> ReportTable | None:
     """Inflow and pressure at the openings of the chip, before and after."""
-    from flowrec.exports import ReportTable
-
-    named = {"assumed": data.assumed, "refined": data.refined, "true": data.truth}
-    fields = {name: field for name, field in named.items() if field is not None}
+    fields = _maps(data) | ({"true": data.truth} if data.truth is not None else {})
     openings = data.scene.chip.openings
     if any(len(field.boundary_values) != len(openings) for field in fields.values()) or not fields:
         return None
@@ -293,35 +287,28 @@ def _refinement(data: ReportData) -> list[str]:
 
 
 def _events(data: ReportData) -> list[ReportTable]:
-    from flowrec.exports import ReportTable, numbered_actions
-
     history = data.history
-    tables: list[ReportTable] = []
-
-    def add(title: str, rows: Sequence[tuple[Any, ...]], columns: tuple[str, ...], left_out: int = 0) -> None:
-        more = max(len(rows) - _EVENTS, 0) + left_out
-        note = f"The first {_EVENTS} of {len(rows) + left_out}; the session holds all." if more else ""
-        if rows:
-            tables.append(ReportTable(title, rows[:_EVENTS], columns, note))
-
-    add(
-        "The operator",
-        [
-            (number, f"{each.time_s:.2f} s", each.action, each.text)
-            for number, each in numbered_actions(history.remarks)
-        ],
-        ("number", "time", "action", "text"),
-    )
+    actions = [
+        (number, f"{each.time_s:.2f} s", each.action, each.text) for number, each in numbered_actions(history.remarks)
+    ]
     events = [
         (f"{each.time_s:.2f} s", each.text if each.level == Level.INFO else f"{each.level}: {each.text}")
         for each in history.remarks
         if not each.action
     ]
-    add("Events", events, ("time", "event"), history.remarks_left_out)
     spans = history.phases.spans
     phases = [(span.name, f"{span.from_s:.2f} s", f"{span.to_s - span.from_s:.2f} s") for span in spans]
-    add("Phases of the mission", phases, ("phase", "from", "for"))
-    return tables
+    tables: list[tuple[str, Sequence[tuple[Any, ...]], tuple[str, ...], int]] = [
+        ("The operator", actions, ("number", "time", "action", "text"), 0),
+        ("Events", events, ("time", "event"), history.remarks_left_out),
+        ("Phases of the mission", phases, ("phase", "from", "for"), 0),
+    ]
+    made = []
+    for title, rows, columns, left_out in tables:
+        total = len(rows) + left_out
+        note = f"The first {_EVENTS} of {total}; the session holds all." if total > min(len(rows), _EVENTS) else ""
+        made += [ReportTable(title, rows[:_EVENTS], columns, note)] if rows else []
+    return made
 
 
 def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]]:
@@ -334,8 +321,6 @@ def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]
 
 
 def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
-    from flowrec.exports import MEANINGS, ReplayPart, ReportTable
-
     # The error that the best map states for itself.
     was, now = (tick.field.error_share if tick.field is not None else None for tick in (pair.recorded, pair.replayed))
     stated: Row = ("stated_flow_error", was, now)
@@ -343,12 +328,13 @@ def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
         (name_of(key), _micro(text_of_figure(key, was)), _micro(text_of_figure(key, now)), MEANINGS.get(key, ""))
         for key, was, now in [*before_after(pair), stated]
     ]
-    tables = [ReportTable("Before and after", texts, ("", "recorded", "replayed", ""), narrow_columns=3)]
     changed = _changed_settings(pair)
+    of_changed = ("setting", "recorded", "replayed") if changed else ()
     note = "" if changed else "The replay has the settings and the code of the recording."
-    tables.append(
-        ReportTable("What was changed", changed, ("setting", "recorded", "replayed") if changed else (), note)
-    )
+    tables = [
+        ReportTable("Before and after", texts, ("", "recorded", "replayed", ""), narrow_columns=3),
+        ReportTable("What was changed", changed, of_changed, note),
+    ]
     return ReplayPart(pair.replay.path.name, tables, refinement_remarks(pair), figure)
 
 

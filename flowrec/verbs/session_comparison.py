@@ -23,12 +23,8 @@ from flowrec.verbs.session_parts import (
     Choice,
     PartOfHead,
     RawTopic,
-    at_text,
+    SessionParts,
     compared_heads,
-    declared_topics,
-    digest_of,
-    head_of,
-    means,
     raw_topics,
 )
 
@@ -39,6 +35,7 @@ _LONG = ("schema", "declaration")  # of a channel: only named where they differ
 _NAMED = 6  # topics and parts of the head that the verdict names
 
 
+Sessions = tuple[Session, Session]
 Raws = tuple[Mapping[str, RawTopic], Mapping[str, RawTopic]]  # of both sessions, by topic
 
 
@@ -50,29 +47,45 @@ class SessionComparison:
     ----------
     names : of the two files.
     choice : what was asked for.
-    covered : the ticks, topics and parts of the head that were compared.
+    total : the ticks of the longer one.
     bytes_alike : size of two files that are the same byte for byte, of which nothing else was compared; else None.
     head : its parts.
     comparison : of the messages, tick by tick.
     apart : topics, or fields of topics, that differ as a whole: held by one file only, declared otherwise. A text each.
     raw : topics that are compared as they are in the file: messages that are the same, that differ, and text.
+    topics : that were compared.
     by_nature : what differs between any two runs, and does here; as names for --ignore.
+    stopped, status : what ended it early, and its exit status; '' if nothing did.
     """
 
     names: tuple[str, str]
     choice: Choice
-    covered: Coverage
+    total: int
     bytes_alike: int | None = None
     head: list[PartOfHead] = field(default_factory=list)
     comparison: Comparison = field(default_factory=Comparison)
     apart: dict[str, str] = field(default_factory=dict)
     raw: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    topics: tuple[str, ...] = ()
     by_nature: tuple[str, ...] = ()
+    stopped: str = ""
+    status: int = 0
 
     @property
     def ticks(self) -> int:
         """Ticks that were compared."""
         return self.comparison.ticks
+
+    @property
+    def covered(self) -> Coverage:
+        """The ticks, topics and parts of the head that were compared."""
+        if self.bytes_alike is not None:
+            return Coverage(self.total, self.total, topics=self.topics, head=HEAD)
+        done, head = self.ticks, tuple(dict.fromkeys(part.name for part in self.head))
+        covered = Coverage(done, done, topics=self.topics, head=head)
+        if not self.stopped:
+            return covered
+        return replace(covered, total=max(done, self.total), stopped=self.stopped, status=self.status)
 
     @property
     def first(self) -> Difference | None:
@@ -87,7 +100,7 @@ class SessionComparison:
     @property
     def same(self) -> bool | None:
         """All that was asked for is the same within its tolerance; None if it was stopped before a difference."""
-        return None if self.covered.stopped and self.same_so_far else self.same_so_far
+        return None if self.stopped and self.same_so_far else self.same_so_far
 
     @property
     def identical(self) -> bool | None:
@@ -97,7 +110,7 @@ class SessionComparison:
     @property
     def exit_status(self) -> int:
         """0 the same, 3 something differs, 130 or 143 stopped."""
-        return self.covered.status if self.covered.stopped else 0 if self.same else 3
+        return self.status if self.stopped else 0 if self.same else 3
 
     def lines(self) -> list[str]:
         """A line for each topic and part of the head, hints, and the verdict."""
@@ -130,10 +143,12 @@ class SessionComparison:
         if not self.same_so_far:
             other = self.comparison.other_numerics
             different = self._different
-            more = [f"{len(different) - _NAMED} more"] if len(different) > _NAMED else []
-            found = f"DIFFERENT in {', '.join([*different[:_NAMED], *more])}" + (f"; {other}" if other else "")
-        what = f"{_count_of(self.covered.topics, 'topic')} and {_count_of(self.covered.head, 'part')} of the head"
-        return f"{self.covered.sentence(found)} ({what}{self.choice.text})"
+            if len(different) > _NAMED:
+                different[_NAMED:] = [f"{len(different) - _NAMED} more"]
+            found = f"DIFFERENT in {', '.join(different)}" + (f"; {other}" if other else "")
+        covered = self.covered
+        what = f"{_count_of(len(covered.topics), 'topic')} and {_count_of(len(covered.head), 'part')} of the head"
+        return f"{covered.sentence(found)} ({what}{self.choice.text})"
 
     @property
     def _different(self) -> list[str]:
@@ -160,35 +175,29 @@ class SessionComparison:
         }
 
 
-def compare_sessions(
-    sessions: tuple[Session, Session], choice: Choice, progress: Callable[[float], None]
-) -> SessionComparison:
+def compare_sessions(sessions: Sessions, choice: Choice, progress: Callable[[float], None]) -> SessionComparison:
     """Compare two sessions; parameters and errors as of `flowrec.compare`."""
     names = _names(*sessions)
-    found = SessionComparison(
-        names, choice, Coverage(0, max(each.reader.counts.get("applied", 0) for each in sessions))
-    )
+    found = SessionComparison(names, choice, max(each.reader.counts.get("applied", 0) for each in sessions))
     try:
-        size_bytes = None if choice.text else _same_bytes(*sessions)
-        if size_bytes is not None:
-            found.bytes_alike = size_bytes
-            topics = tuple(sessions[0].topics)
-            found.covered = replace(found.covered, done=found.covered.total, topics=topics, head=HEAD)
+        found.bytes_alike = None if choice.text else _same_bytes(*sessions)
+        if found.bytes_alike is not None:
+            found.topics = tuple(sessions[0].topics)
             return found
-        _compare_heads(found, sessions)
+        parts = SessionParts.of(sessions[0]), SessionParts.of(sessions[1])
+        choice.check([name for part in parts for name in (*part.head, *part.declared)])
+        found.head = compared_heads([part.head for part in parts], names, choice)
         raw = raw_topics(sessions[0], choice), raw_topics(sessions[1], choice)
         _compare_raw(found, raw)
         _compare_ticks(found, sessions, progress)
-        _compare_declared(found, sessions)
+        _compare_declared(found, [part.declared for part in parts])
         _compare_unread(found, sessions, raw)
-        _compare_digests(found, sessions)
+        if found.identical and not choice.text and not any(session.run.in_parts for session in sessions):
+            _compare_digests(found, [part.digest for part in parts])
     except KeyboardInterrupt as error:
         ended = Ended.of(error)
-        done, total = found.ticks, max(found.ticks, found.covered.total)
-        found.covered = replace(found.covered, done=done, total=total, stopped=ended.why, status=ended.status)
-        ended.result = found
+        found.stopped, found.status, ended.result = ended.why, ended.status, found
         raise ended from error
-    found.covered = replace(found.covered, done=found.ticks, total=found.ticks)
     found.by_nature = _by_nature(found)
     return found
 
@@ -200,8 +209,8 @@ def _names(first: Session, second: Session) -> tuple[str, str]:
     return str(first.path), str(second.path)
 
 
-def _count_of(names: Sequence[str], noun: str) -> str:
-    return f"{len(names)} {noun}{'s' * (len(names) != 1)}"
+def _count_of(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def _same_bytes(first: Session, second: Session) -> int | None:
@@ -219,13 +228,6 @@ def _same_bytes(first: Session, second: Session) -> int | None:
     return sum(sizes[0])
 
 
-def _compare_heads(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
-    heads = [head_of(session) for session in sessions]
-    found.choice.check([*heads[0], *heads[1], *(name for each in sessions for name in declared_topics(each))])
-    found.head = compared_heads(heads, found.names, found.choice)
-    found.covered = replace(found.covered, head=tuple(part.name for part in found.head))
-
-
 def _compare_raw(found: SessionComparison, raw: Raws) -> None:
     """Compare the topics that are no field of `Tick`."""
     known = found.choice.topics.by_path
@@ -234,15 +236,15 @@ def _compare_raw(found: SessionComparison, raw: Raws) -> None:
         if topic not in was or topic not in now:
             found.apart[topic] = f"only in {found.names[topic not in was]}"
             continue
-        same, wrong, stamp_ns = was[topic].same_as(now[topic])
-        found.raw[topic] = (same, wrong, f", {wrong} DIFFERENT{at_text(stamp_ns)}" if wrong else "")
-    found.covered = replace(found.covered, topics=tuple(dict.fromkeys((*was, *now))))
+        same, wrong, where = was[topic].same_as(now[topic])
+        found.raw[topic] = (same, wrong, f", {wrong} DIFFERENT{where}" if wrong else "")
+    found.topics = tuple(dict.fromkeys((*was, *now)))
 
 
-def _compare_declared(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+def _compare_declared(found: SessionComparison, declared: Sequence[Mapping[str, Mapping[str, str]]]) -> None:
     """Compare what the topics declare that both hold: encoding, depth, region, role, and the schema."""
-    was, now = (declared_topics(session) for session in sessions)
-    for topic in found.covered.topics:
+    was, now = declared
+    for topic in found.topics:
         if topic not in was or topic not in now or topic in found.apart:
             continue
         keys = [key for key in {**was[topic], **now[topic]} if was[topic].get(key) != now[topic].get(key)]
@@ -251,55 +253,47 @@ def _compare_declared(found: SessionComparison, sessions: tuple[Session, Session
             found.apart[topic] = f"declared otherwise: {'; '.join(texts) or f'another {keys[0]}'}"
 
 
-def _compare_unread(found: SessionComparison, sessions: tuple[Session, Session], raw: Raws) -> None:
+def _compare_unread(found: SessionComparison, sessions: Sessions, raw: Raws) -> None:
     """Messages that are the same in all that flowrec reads, and not in the file: fields of foxglove's schemas."""
     if sessions[0].header.start_unix_ns != sessions[1].header.start_unix_ns:
         return  # the wall clock is in them
     for topic, count in found.comparison.topics.items():
         told = topic in found.apart or count.different or count.within_tolerance
         if not told and topic in raw[0] and topic in raw[1]:
-            _, wrong, stamp_ns = raw[0][topic].same_as(raw[1][topic])
+            _, wrong, where = raw[0][topic].same_as(raw[1][topic])
             if wrong:
-                found.apart[topic] = f"{wrong} differ in what flowrec does not read{at_text(stamp_ns)}"
+                found.apart[topic] = f"{wrong} differ in what flowrec does not read{where}"
 
 
-def _compare_digests(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+def _compare_digests(found: SessionComparison, digests: Sequence[Mapping[str, str] | None]) -> None:
     """Two digests that differ although all is the same: of numbers and order of messages, which no reader returns."""
-    if not found.identical or found.choice.text or any(session.run.in_parts for session in sessions):
-        return
-    was, now = (digest_of(session) for session in sessions)
+    was, now = digests
     if was is not None and now is not None and was != now:
         topics = [key for key in {**was, **now} if was.get(key) != now.get(key)]
         told = {"": f"states others for {', '.join(topics)}: the numbers of the messages differ"}
         found.head.append(PartOfHead("digest", 1, told))
 
 
-def _compare_ticks(
-    found: SessionComparison, sessions: tuple[Session, Session], progress: Callable[[float], None]
-) -> None:
+def _compare_ticks(found: SessionComparison, sessions: Sessions, progress: Callable[[float], None]) -> None:
     """Compare the messages tick by tick; a topic or a field that one file does not have is told once."""
-    counts = [session.reader.counts for session in sessions]
-    fields_of = [session.reader.recorded_fields for session in sessions]
     left_out, compared = set(), []
     topics = found.choice.topics.topics
     for topic in topics:
-        there = [bool(each.get(topic.field)) for each in counts]
-        if not found.choice(topic.path) or not all(there):
+        counts = [each.reader.counts.get(topic.field, 0) for each in sessions]
+        if not found.choice(topic.path) or not any(counts):
             left_out.add(topic.path)
-        if not found.choice(topic.path) or not any(there):
             continue
         compared.append(topic.path)
-        if not all(there):
-            number = counts[not there[0]].get(topic.field, 0)
-            holder = found.names[not there[0]]
-            found.apart[topic.path] = f"only in {holder}, {number} message{'s' * (number != 1)}"
+        if not all(counts):
+            left_out.add(topic.path)
+            holder = found.names[not counts[0]]
+            found.apart[topic.path] = f"only in {holder}, {_count_of(sum(counts), 'message')}"
             continue
-        known = [fields_of[side].get(topic.field, frozenset()) for side in (0, 1)]
-        for side in (0, 1):
-            lone = sorted(known[side] - known[1 - side])
+        was, now = (each.reader.recorded_fields.get(topic.field, frozenset()) for each in sessions)
+        for holder, lone in zip(found.names, (was - now, now - was), strict=True):
             if lone:
-                found.apart[topic.path] = f"{', '.join(lone)}: only in {found.names[side]}"
-    found.covered = replace(found.covered, topics=(*compared, *found.covered.topics))
+                found.apart[topic.path] = f"{', '.join(sorted(lone))}: only in {holder}"
+    found.topics = (*compared, *found.topics)
     sides = Side.of("first", sessions[0]), Side.of("second", sessions[1])
     found.comparison = comparison = Comparison(tuple(Role), sides, frozenset(left_out))
     comparison.not_recorded.clear()  # told above, where one of the two has it
@@ -311,9 +305,7 @@ def _compare_ticks(
         progress(seconds(stamp_ns - first_ns))
 
 
-def _compare_paired_ticks(
-    comparison: Comparison, sessions: tuple[Session, Session], *, with_frames: bool
-) -> Iterator[int]:
+def _compare_paired_ticks(comparison: Comparison, sessions: Sessions, *, with_frames: bool) -> Iterator[int]:
     """Compare tick by tick; yields the stamp of each in ns."""
     ticks = [zip(each.ticks(with_frames=with_frames), repeat(side)) for side, each in enumerate(sessions)]
 
@@ -334,9 +326,7 @@ def _by_nature(found: SessionComparison) -> tuple[str, ...]:
     different = {part.name for part in found.head if part.differences}
     topics = [*(topic for topic, count in found.comparison.topics.items() if count.different), *found.apart]
     names = [
-        word
-        for word in _BY_NATURE
-        if word in different or any(means(word, topic, found.choice.topics) for topic in topics)
+        word for word in _BY_NATURE if word in different or any(found.choice.means(word, topic) for topic in topics)
     ]
     drawn = [topic for topic, (_, wrong, _) in found.raw.items() if wrong]
     if "start" in different and drawn:

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowrec.core import FIXED, Role, TopicTable, UsageError, printable, seconds
 from flowrec.store import FRAME_PATH, Session, SessionHeader, SessionMetadata, is_header_file, toml_table
@@ -50,8 +50,17 @@ class Choice:
 
     def __call__(self, name: str) -> bool:
         """True if something of this name is compared."""
-        chosen = not self.only or any(means(pattern, name, self.topics) for pattern in self.only)
-        return chosen and not any(means(pattern, name, self.topics) for pattern in self.ignore)
+        chosen = not self.only or any(self.means(pattern, name) for pattern in self.only)
+        return chosen and not any(self.means(pattern, name) for pattern in self.ignore)
+
+    def means(self, pattern: str, name: str) -> bool:
+        """True if a pattern or a word for several means a topic or an item of the head."""
+        known, topic = self.topics.by_path, name.startswith("/")
+        if pattern in _ROLES:
+            return name in known and known[name].role is _ROLES[pattern]
+        if pattern in ("head", DRAWINGS):
+            return (topic and name not in known) if pattern == DRAWINGS else not topic
+        return fnmatchcase(name, pattern) or name.startswith(f"{pattern}{'/' if topic else '.'}")
 
     @property
     def text(self) -> str:
@@ -64,43 +73,52 @@ class Choice:
         for option, patterns in (("--only", self.only), ("--ignore", self.ignore)):
             for pattern in patterns:
                 known = (*names, *GROUPS, *HEAD)
-                if pattern in (*GROUPS, *HEAD) or any(means(pattern, name, self.topics) for name in names):
+                if pattern in (*GROUPS, *HEAD) or any(self.means(pattern, name) for name in names):
                     continue
                 near = difflib.get_close_matches(pattern, known, 3, 0.5)
                 meant = f"did you mean {' or '.join(near)}?" if near else f"words for several are {', '.join(GROUPS)}"
                 raise UsageError(f"{option} {pattern}: is no topic and no part of the head of the two; {meant}")
 
 
-def means(pattern: str, name: str, topics: TopicTable) -> bool:
-    """True if a pattern or a word for several means a topic or an item of the head."""
-    known, topic = topics.by_path, name.startswith("/")
-    if pattern in _ROLES:
-        return name in known and known[name].role is _ROLES[pattern]
-    if pattern in ("head", DRAWINGS):
-        return (topic and name not in known) if pattern == DRAWINGS else not topic
-    return fnmatchcase(name, pattern) or name.startswith(f"{pattern}{'/' if topic else '.'}")
+class SessionParts(NamedTuple):
+    """A session without the messages of its ticks.
 
+    Attributes
+    ----------
+    head : settings, chip, origin, outcome, and the records of other programs, by name.
+    declared : declarations of the channels, by topic: the metadata, and a hash of the schema.
+    digest : of the first file, by topic; None without one.
+    """
 
-def head_of(session: Session) -> dict[str, Item]:
-    """All of a session's head by name: settings, chip, origin, outcome, and the records of other programs."""
-    items: dict[str, Item] = {}
-    with SessionMetadata(session.run.files[0].path) as first:
-        header = first.header
-        items |= _of_header(header, str(session.path))
-        items |= {f"outcome.{key}": text for key, text in session.run.outcome.items()}
-        if session.run.part is not None:
-            part = session.run.part
-            items["part"] = f"{part.kind} {part.number}"
-        if first.digest is not None:
-            items["digest"] = "there"
-        for record in first.metadata:
-            if not record.name.startswith(_OWN):
-                content = first.source.metadata(record)
-                items |= {f"records.{record.name}.{key}": text for key, text in content.items()}
-        for place in first.attachments:
-            if not is_header_file(place.name):
-                items[f"records.{place.name}"] = first.source.attachment(place)
-    return items
+    head: dict[str, Item]
+    declared: dict[str, dict[str, str]]
+    digest: dict[str, str] | None
+
+    @classmethod
+    def of(cls, session: Session) -> SessionParts:
+        """Read those of a session; of a run in several files the first one states them."""
+        with SessionMetadata(session.run.files[0].path) as first:
+            items = dict(_of_header(first.header, str(session.path)))
+            items |= {f"outcome.{key}": text for key, text in session.run.outcome.items()}
+            if session.run.part is not None:
+                part = session.run.part
+                items["part"] = f"{part.kind} {part.number}"
+            if first.digest is not None:
+                items["digest"] = "there"
+            for record in first.metadata:
+                if not record.name.startswith(_OWN):
+                    content = first.source.metadata(record)
+                    items |= {f"records.{record.name}.{key}": text for key, text in content.items()}
+            for place in first.attachments:
+                if not is_header_file(place.name):
+                    items[f"records.{place.name}"] = first.source.attachment(place)
+            declared = {}
+            for channel in first.channels.values():
+                schema = first.schemas.get(channel.schema_id)
+                text = f"{schema.name} {schema.encoding} ".encode() + schema.data if schema is not None else b""
+                hashed = hashlib.blake2b(text, digest_size=8).hexdigest()
+                declared[channel.topic] = {**channel.metadata, "schema": hashed}
+            return cls(items, declared, first.digest)
 
 
 def _of_header(header: SessionHeader, path: str) -> Iterator[tuple[str, Item]]:
@@ -127,8 +145,7 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]
             yield f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-@dataclass(frozen=True, slots=True)
-class PartOfHead:
+class PartOfHead(NamedTuple):
     """Comparison of one part of two heads.
 
     Attributes
@@ -145,10 +162,11 @@ class PartOfHead:
         """A line of text."""
         if not self.differences:
             return printable(f"{self.name:{width}s}  identical")
-        shown = [f"{key} {text}".strip() for key, text in list(self.differences.items())[:_NAMED]]
-        more = len(self.differences) - len(shown)
-        listed = "; ".join([*shown, *([f"{more} more"] if more else [])])
-        return printable(f"{self.name:{width}s}  {len(self.differences)} of {self.items} DIFFERENT: {listed}")
+        shown = [f"{key} {text}".strip() for key, text in self.differences.items()]
+        if len(shown) > _NAMED:
+            shown[_NAMED:] = [f"{len(shown) - _NAMED} more"]
+        count = f"{len(self.differences)} of {self.items}"
+        return printable(f"{self.name:{width}s}  {count} DIFFERENT: {'; '.join(shown)}")
 
 
 def compared_heads(
@@ -198,15 +216,15 @@ class RawTopic:
         self.log_ns.append(log_ns)
         self.hashes.append(int.from_bytes(hashlib.blake2b(payload, digest_size=8).digest(), "little"))
 
-    def same_as(self, other: RawTopic) -> tuple[int, int, int | None]:
-        """Messages that are the same and that differ, and the stamp in ns of the first that differs."""
+    def same_as(self, other: RawTopic) -> tuple[int, int, str]:
+        """Messages that are the same and that differ, and as text when the first does."""
         count = max(len(self.log_ns), len(other.log_ns))
         if self.log_ns == other.log_ns and self.hashes == other.hashes:
-            return count, 0, None
+            return count, 0, ""
         here, there = (Counter(zip(each.log_ns, each.hashes, strict=True)) for each in (self, other))
         same = (here & there).total()
         apart = [stamp_ns for stamp_ns, _ in ((here - there) + (there - here))]
-        return same, count - same, min(apart, default=None)
+        return same, count - same, f", the first at {seconds(min(apart)):.3f} s" if apart else ""
 
 
 def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, RawTopic]:
@@ -230,25 +248,3 @@ def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, Raw
                         assert isinstance(record.payload, memoryview)
                         found.setdefault(wanted[record.channel], RawTopic()).add(record.log_ns, bytes(record.payload))
     return found
-
-
-def declared_topics(session: Session) -> dict[str, dict[str, str]]:
-    """Declarations of the channels of a session, by topic: the metadata, and a hash of the schema."""
-    found: dict[str, dict[str, str]] = {}
-    with SessionMetadata(session.run.files[0].path) as opened:
-        for channel in opened.channels.values():
-            schema = opened.schemas.get(channel.schema_id)
-            text = f"{schema.name} {schema.encoding} ".encode() + schema.data if schema is not None else b""
-            found[channel.topic] = {**channel.metadata, "schema": hashlib.blake2b(text, digest_size=8).hexdigest()}
-    return found
-
-
-def digest_of(session: Session) -> dict[str, str] | None:
-    """Digest of a session in one file, by topic; None without one."""
-    with SessionMetadata(session.run.files[0].path) as opened:
-        return opened.digest
-
-
-def at_text(stamp_ns: int | None) -> str:
-    """Place of the first difference, as text."""
-    return "" if stamp_ns is None else f", the first at {seconds(stamp_ns):.3f} s"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     ANSWERED_BY,
@@ -19,6 +18,7 @@ from flowrec.core import (
     NUMERICS_VERSION,
     WORKER_FIELDS,
     Applied,
+    Floats,
     Mission,
     Observations,
     Outcome,
@@ -60,7 +60,7 @@ from flowrec.store import (
 from flowrec.verbs.comparison import Comparison, Side
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.replay_change import Change
-from flowrec.verbs.replay_result import Replayed, WorkerCheck, WorkerResults, coverage_of, digest_lines
+from flowrec.verbs.replay_result import Replay, WorkerCheck, WorkerResults, coverage_of, digest_lines
 from flowrec.verbs.run_summary import figures_of, judges_of
 
 
@@ -75,7 +75,7 @@ def replay_session(
     control: Unattended | None = None,
     *,
     segment_ns: tuple[int | None, int] | None = None,
-) -> Replayed:
+) -> Replay:
     """Replay a session, in any thread; write the result to a new session if `out` is given.
 
     Parameters
@@ -105,7 +105,11 @@ def replay_session(
         stack.enter_context(input_blamed(replay.session, replay.config, "replayed"))
         writer, judges, sinks = None, judges_of(replay.pipeline), list[Sink]()
         if out is not None:
-            writer = stack.enter_context(replay.writer_to(output))
+            session, config, topics = replay.session, replay.config, replay.pipeline.topics
+            facts = facts_of(config, session.provenance)
+            writer = stack.enter_context(
+                session_writer(output, config, session.chip, parent=session.path, facts=facts, topics=topics)
+            )
             sinks += [writer if frames else WithoutFrames(writer), *judges]
         replay.show_progress(stack)
         result = replay.run(sinks)
@@ -114,6 +118,7 @@ def replay_session(
             result.doubts = [doubt for judge in judges for doubt in judge.doubts()]
             result.doubts += map_doubts(refined, result.config.camera.um_per_px) if refined is not None else []
             _close(writer, result)
+            result.file = out
     if verify and segment_ns is None:
         replay.read_digest(result)
     return result
@@ -172,24 +177,13 @@ class _Replay:
             change.same_orders(recorded, self.config) if stands else (),
         )
 
-    def writer_to(self, output: Output) -> AbstractContextManager[SessionWriter]:
-        """Context of the session file of the replay."""
-        return session_writer(
-            output,
-            self.config,
-            self.session.chip,
-            parent=self.session.path,
-            facts=facts_of(self.config, self.session.provenance),
-            topics=self.pipeline.topics,
-        )
-
     def show_progress(self, stack: ExitStack) -> None:
         """Show the bar until the stack is left."""
         length_s = max(seconds(self._between_ns[1] - self._first_ns), 1e-3)
         self._progress = stack.enter_context(self.control.progress(f"replaying {self.session.path.name}", length_s))
         self._worker.announce = self._progress.stage
 
-    def run(self, sinks: list[Sink]) -> Replayed:
+    def run(self, sinks: list[Sink]) -> Replay:
         """Replay all ticks; the first of the sinks also takes results that the recording ended too early for."""
         control = self.control.run_control
         with self.control.end_on_signals():
@@ -215,7 +209,7 @@ class _Replay:
                 last = control.unless_stopped(closing, last)
             if last is not report.last and sinks:
                 sinks[0].write(last)
-        return Replayed(
+        return Replay(
             self.session,
             self.config,
             report,
@@ -240,7 +234,7 @@ class _Replay:
         self._commands.add(recorded.demand, tick.demand)
         self._progress(seconds(tick.stamp_ns - self._first_ns))
 
-    def read_digest(self, result: Replayed) -> None:
+    def read_digest(self, result: Replay) -> None:
         """Compare the files of the session with their digests."""
         control = self.control.run_control
         with self.control.end_on_signals():
@@ -271,7 +265,7 @@ def _between_ns(
     return start_ns, end_ns
 
 
-def _close(writer: SessionWriter, result: Replayed) -> None:
+def _close(writer: SessionWriter, result: Replay) -> None:
     """Close the file of a replay with its figures, its doubts and how it ended."""
     covered = result.covered
     ended = Outcome.STOPPED if covered.stopped else Outcome.REPLAYED
@@ -383,7 +377,7 @@ def _closing_work(
     return tick if tick.refined is not last.refined or tick.route is not last.route else last
 
 
-def planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
+def planned_from(recorded: Tick, last: Tick) -> Floats:
     """The start of the recorded route, else the position of the robot: a point (2,) in um."""
     if recorded.route is not None and recorded.route.reachable and recorded.mission is not None:
         return np.array(recorded.route.waypoints_um[0], np.float64)

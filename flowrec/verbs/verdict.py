@@ -8,7 +8,6 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from dataclasses import asdict, dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -213,13 +212,6 @@ UNFINISHED = "not finished"
 _MARKS = {"bad": "!!", "odd": "! "}
 
 
-class Severity(StrEnum):
-    """Severity of a finding."""
-
-    BAD = "bad"  # the session can not be used as it is
-    ODD = "odd"  # something was lost or is unusual; the session can be used
-
-
 @dataclass(frozen=True, slots=True)
 class Gap:
     """A time without a frame."""
@@ -232,7 +224,7 @@ class Gap:
 class CheckFinding:
     """Something wrong or unusual."""
 
-    level: Severity
+    level: Literal["bad", "odd"]  # the session can not be used as it is; something was lost or is unusual
     about: str
     text: str
 
@@ -271,7 +263,7 @@ class Verdict:
         if self.covered.stopped:
             return "stopped"
         levels = {finding.level for finding in self.findings}
-        return "bad" if Severity.BAD in levels else "usable" if levels else "good"
+        return "bad" if "bad" in levels else "usable" if levels else "good"
 
     @property
     def exit_status(self) -> int:
@@ -288,11 +280,11 @@ class Verdict:
 
     def odd(self, about: str, text: str) -> None:
         """Add a finding: something was lost or is unusual."""
-        self.findings.append(CheckFinding(Severity.ODD, about, printable(text)))
+        self.findings.append(CheckFinding("odd", about, printable(text)))
 
     def bad(self, about: str, text: str) -> None:
         """Add a finding: the session can not be replayed as it is."""
-        self.findings.append(CheckFinding(Severity.BAD, about, printable(text)))
+        self.findings.append(CheckFinding("bad", about, printable(text)))
 
     def fact(self, about: str, text: str) -> None:
         """Add a fact."""

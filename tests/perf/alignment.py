@@ -131,7 +131,7 @@ def ours(given: Mission, log: FieldLog) -> Found:
         fit = fit_log(given.stamps_ns, given.positions_um, log, ANYWHERE, given.flow)
     except UsageError as error:
         return Found(0.0, 1.0, 0.0, accepted=False, why=str(error))
-    return Found(fit.offset_s, fit.rate, fit.explained, fit.accepted, fit.refusal)
+    return Found(fit.offset_s, fit.rate, fit.explained, not fit.refusal, fit.refusal)
 
 
 def _correlated(pick: Callable[[Floats, Floats], tuple[Floats, Floats]], given: Mission, log: FieldLog) -> Found:

@@ -14,7 +14,7 @@ import flowrec
 from flowrec.core.errors import UsageError
 from flowrec.core.topics import TOPICS
 from flowrec.verbs.cli import app
-from flowrec.verbs.replay_made import BeforeAfter
+from flowrec.verbs.replay_result import BeforeAfter
 from tests.conftest import HANG_S
 from tests.extras import why
 

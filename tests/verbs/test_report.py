@@ -246,7 +246,7 @@ def test_a_full_disk_halfway_leaves_neither_page_nor_figures(tmp_path: Path, mon
     monkeypatch.setattr(command, "_figures", lambda *_: [])
     monkeypatch.setattr(command, "_files", lambda *_: [("a.svg", b"1"), ("b.svg", b"2")])
     monkeypatch.setattr(command, "_page", lambda *_: None)
-    monkeypatch.setattr("flowrec.exports.render", lambda _: "<html>")
+    monkeypatch.setattr(command, "render", lambda _: "<html>")
     write = Path.write_bytes
 
     def full(path: Path, content: bytes) -> int:

@@ -34,7 +34,7 @@ from flowrec.core.system.outputs import OutputError
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.cli import app
-from flowrec.verbs.replay_made import refinement_remarks
+from flowrec.verbs.replay_result import refinement_remarks
 from tests.archive.sweep.rows import row_of
 from tests.store.made_up import HEADER, ticks_of
 

@@ -71,7 +71,7 @@ def test_a_scale_that_the_walls_contradict_is_told_and_measured_and_a_right_one_
     assert (um_per_px is not None) == told
     if told:
         assert um_per_px == pytest.approx(13.4, rel=2e-3)
-    assert other_scale(replace(fit, std=np.full(4, 0.1)), stated) is None  # where the picture does not determine it
+    assert other_scale(fit._replace(std=np.full(4, 0.1)), stated) is None  # where the picture does not determine it
 
 
 @pytest.fixture

@@ -156,7 +156,7 @@ def test_columns_may_stand_in_any_order_beside_others_and_behind_a_byte_order_ma
 
 def test_a_run_takes_the_written_settings_and_the_printed_ones_alike(tmp_path):
     path, out = file_of(tmp_path, measured(5)), tmp_path / "out.toml"
-    fit = calibrate_coils(path, out)
+    fit = calibrate_coils(path, out).fit
     written = load_config(out).coils
     assert written == load_config(None, as_sets(settings_of(fit))).coils
     np.testing.assert_allclose(written.mt_per_a, fit.mt_per_a, atol=0.01 * fit.mt_per_a_std.max())

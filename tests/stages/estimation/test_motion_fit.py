@@ -104,7 +104,7 @@ def fit(stamps: np.ndarray, positions: np.ndarray, log: Log, within: SearchRange
 def test_a_late_log_is_found_to_3_ms_in_any_flow(flow, late_s: float) -> None:
     log = commands(3, 15.0)
     found = fit(*track(log, 3, 15.0, flow), log.late(late_s))
-    assert found.accepted and found.rate == 1.0
+    assert not found.refusal and found.rate == 1.0
     assert found.offset_s == pytest.approx(late_s - 0.04, rel=0.0, abs=3e-3)
     assert found.um_per_rev == pytest.approx(K, abs=3.0 * found.um_per_rev_std)
     assert abs(found.heading_offset_rad) < 3.0 * found.heading_offset_std_rad and not found.mirrored
@@ -115,7 +115,7 @@ def test_the_rate_of_the_movies_clock_is_found_to_a_thousandth(rate: float) -> N
     log = commands(4, 24.0)
     stamps, positions = track(log, 4, 14.0)
     found = fit(stamps / rate + 2.0, positions, log)
-    assert found.accepted and found.rate == pytest.approx(rate, rel=1e-3)
+    assert not found.refusal and found.rate == pytest.approx(rate, rel=1e-3)
     middle_s = float(stamps.mean())
     assert found.offset_s + found.rate * (middle_s / rate + 2.0) == pytest.approx(middle_s - 0.04, abs=3e-3)
 
@@ -125,7 +125,7 @@ def test_a_movie_from_the_middle_of_a_long_log_on_another_clock() -> None:
     stamps, positions = track(log, 5, 220.0, still)
     part = stamps > 150.0
     found = fit(stamps[part] - 150.0, positions[part], log, SearchRange(least_rate=0.99, largest_rate=1.01))
-    assert found.accepted and found.offset_s == pytest.approx(150.0 - 0.04, abs=3e-3)
+    assert not found.refusal and found.offset_s == pytest.approx(150.0 - 0.04, abs=3e-3)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -136,7 +136,7 @@ def test_axes_of_the_headings_are_found(mirrored: bool) -> None:
     seen = positions * [1.0, -1.0] if mirrored else positions
     seen = seen @ [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]
     found = fit(stamps, seen, log)
-    assert found.accepted and found.mirrored == mirrored
+    assert not found.refusal and found.mirrored == mirrored
     assert found.heading_offset_rad == pytest.approx(turn, abs=3.0 * found.heading_offset_std_rad)
 
 
@@ -146,7 +146,7 @@ def test_one_wrong_position_in_thirty_does_not_hide_the_log() -> None:
     wrong, away = np.arange(10, len(stamps) - 10, 30), rng.uniform(-math.pi, math.pi, len(stamps))
     positions[wrong] += 150.0 * np.column_stack([np.cos(away), np.sin(away)])[wrong]
     found = fit(stamps, positions, log)
-    assert found.accepted and found.left_out >= len(wrong) - 1
+    assert not found.refusal and found.left_out >= len(wrong) - 1
     assert found.offset_s == pytest.approx(-0.04, abs=3e-3)
 
 
@@ -161,9 +161,9 @@ def test_frames_without_the_robot_and_positions_of_another_particle_neither_hide
     kept = rng.random(len(stamps)) > 0.2
     kept[400:430] = False
     found = fit(stamps[kept], wrong[kept], log)
-    assert found.accepted
+    assert not found.refusal
     every = fit(stamps, wrong, log)
-    assert every.accepted and 60 <= every.left_out <= 66  # those on the other particle, and the single ones
+    assert not every.refusal and 60 <= every.left_out <= 66  # those on the other particle, and the single ones
     assert found.offset_s == pytest.approx(-0.04, abs=3e-3)
     assert found.um_per_rev == pytest.approx(K, abs=3.0 * found.um_per_rev_std)
 
@@ -175,7 +175,7 @@ def test_of_noise_alone_a_log_explains_little(seed: int) -> None:
     stamps = np.arange(0.0, 8.0, 1.0 / 30.0)
     drifting = np.cumsum(rng.normal(0.0, 1.0, (len(stamps), 2)), axis=0)
     found = fit(stamps, drifting + rng.normal(0.0, 3.0, drifting.shape), log, SearchRange())
-    assert found.explained < 0.4 and not found.accepted
+    assert found.explained < 0.4 and found.refusal
 
 
 @pytest.mark.parametrize("other", ["another run", "backwards"])
