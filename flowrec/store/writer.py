@@ -27,11 +27,11 @@ from flowrec.core import (
 )
 from flowrec.store.channels import FRAME_PATH, codec_of_extra
 from flowrec.store.codec import codec_of, encode_record
-from flowrec.store.recorder_process import RecorderProcess
-from flowrec.store.recording import RecorderThread, RecordingPlan
+from flowrec.store.recorder_process import RecorderProcess, RecorderThread
 from flowrec.store.ring_buffer import SnapshotTrigger
 from flowrec.store.roi import WindowSelector
 from flowrec.store.run_files import refuse_if_taken, run_files
+from flowrec.store.segments import RecordingPlan
 from flowrec.store.session_file import Snapshot, WriterOptions
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.viewer_scene import ChipCamera
