@@ -6,7 +6,7 @@ import contextlib
 import heapq
 import itertools
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from operator import attrgetter
 from pathlib import Path
@@ -56,23 +56,30 @@ class FileReader(SessionContents):
     def new_messages(self, start_ns: int | None, fields: Collection[str]) -> Iterator[tuple[int, NewMessages]]:
         """Stamp and new messages of some topics of all ticks, or of those at and after `start_ns`."""
         size = _StateSize(self.source.path)
-        for stamp_ns, records in itertools.groupby(self._records_from(start_ns, fields), key=_by_time):
+        read = dict.fromkeys(self._channels_of(fields), 0)
+        for stamp_ns, records in itertools.groupby(self._read(fields, start_ns or 0), key=_by_time):
             new: NewMessages = {}
             for record in records:
                 field = self.fields[record.channel]
                 size.add(field, record)
                 new[field] = self._message(record)
+                read[record.channel] += 1
             yield stamp_ns, new
+        for channel, count in read.items() if start_ns is None else ():
+            announced = self.statistics.channel_message_counts.get(channel, 0)
+            if count != announced:
+                path = self.channels[channel].topic
+                raise DamageError(self.source.path, f"{announced} messages of {path} are announced, {count} were read")
 
     def messages(self, field: str) -> Iterator[tuple[int, Any]]:
         """All messages of one topic, each with the stamp of its tick."""
-        for record in self._records_of(self._channels_of({field}), self._decoded_frame):
+        for record in self._read({field}):
             yield record.log_ns, self._message(record)
 
     def rows(self, fields: Collection[str]) -> Iterator[tuple[int, str, Row]]:
-        """Stamp of the tick, field of Tick and row of plain values of each message of some topics."""
+        """Stamp of the tick, field of Tick and row of plain values of each message of some topics but the images."""
         decoders = {channel: self.row_decoder(channel) for channel in self._channels_of(fields)}
-        for record in self._records_of(set(decoders)):
+        for record in self._read(fields):
             try:
                 row = decoders[record.channel](record)
             except SessionError as error:
@@ -124,13 +131,6 @@ class FileReader(SessionContents):
             return record
         return record._replace(payload=frame) if frame.image.nbytes <= _GROWTH * len(record.payload) else record
 
-    def _records_of(self, channels: set[int], decode: _Decode | None = None) -> Iterator[Record]:
-        """The messages of some channels in order of time."""
-        with _threads() as executor:
-            for record in _merge(self.source, self._chunks_with(channels), executor, decode):
-                if record.channel in channels:
-                    yield record
-
     def _restore(self, record: Record) -> Any:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
         key = (self.source.path, record.channel, record.log_ns)
@@ -139,37 +139,25 @@ class FileReader(SessionContents):
             del self._cache[next(iter(self._cache))]
         return message
 
-    def _records_from(self, start_ns: int | None, fields: Collection[str]) -> Iterator[Record]:
+    def _read(self, fields: Collection[str], start_ns: int = 0) -> Iterator[Record]:
         """The messages of some topics from a time on, state and frames merged."""
-        start = 0 if start_ns is None else start_ns
-        state, frames = self._chunks_from(start)
         wanted = self._channels_of(fields)
-        read = dict.fromkeys(wanted, 0)
+        state, frames = self._chunks_from(start_ns, wanted)
         with _threads() as executor:
-            streams = [_merge(self.source, state, executor)]
-            if wanted & self._frame_channels:
-                streams.append(_merge(self.source, frames, executor, self._decoded_frame))
-            for record in heapq.merge(*streams, key=_by_time):
-                if record.log_ns >= start and record.channel in wanted:
-                    read[record.channel] += 1
+            merged = (
+                _merge(self.source, state, executor),
+                _merge(self.source, frames, executor, self._decoded_frame),
+            )
+            for record in heapq.merge(*merged, key=_by_time):
+                if record.log_ns >= start_ns and record.channel in wanted:
                     yield record
-        if start_ns is None:
-            self._check_counts(read)
 
-    def _check_counts(self, read: Mapping[int, int]) -> None:
-        """Raise DamageError for a file with other numbers of messages than its index says."""
-        for channel, count in read.items():
-            announced = self.statistics.channel_message_counts.get(channel, 0)
-            if count != announced:
-                path = self.channels[channel].topic
-                raise DamageError(self.source.path, f"{announced} messages of {path} are announced, {count} were read")
-
-    def _chunks_from(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
-        """Chunks that end at or after a time: those with anything but frames, and those with frames only."""
+    def _chunks_from(self, start_ns: int, channels: set[int]) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
+        """Chunks of channels that end at or after a time: with anything but frames, and with frames only."""
         state: list[ChunkIndex] = []
         frames: list[ChunkIndex] = []
         largest_bytes = PIXELS_LIMIT * pixel_type(self.frame_bits).itemsize + _LARGE_CHUNK_BYTES
-        for chunk in self._chunks_with(set(self.fields)):
+        for chunk in self._chunks_with(channels):
             if chunk.message_end_time >= start_ns:
                 only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
                 if only_frames and chunk.uncompressed_size > largest_bytes:

@@ -23,7 +23,6 @@ from flowrec.core import (
 from flowrec.store.audit import disagreements, edits_of
 from flowrec.store.channels import SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
-from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.mcap_writer import disk_errors, new_mcap
 from flowrec.store.reader import SessionReader
@@ -241,8 +240,8 @@ def _nothing_on_disk(path: Path) -> NothingSavedError:
 def _check_intact(path: Path) -> Recovered | None:
     """A file of which every chunk is intact; None for any other."""
     try:
-        with SessionReader(path, file := FileReader(path)) as reader:
-            _ = file.header
+        with SessionReader(path) as reader:
+            file, _ = reader.file(0), reader.header
             for _tick in reader.ticks():
                 pass
             for chunk in file.chunks:  # the rest: viewer topics
@@ -257,8 +256,8 @@ def _check_intact(path: Path) -> Recovered | None:
 def _verify(draft: Path) -> Recovered | None:
     """A file that was just written; None unless every message is as it was meant, and the index agrees with them."""
     try:
-        with SessionReader(draft, file := FileReader(draft)) as reader:
-            _ = file.header
+        with SessionReader(draft) as reader:
+            file, _ = reader.file(0), reader.header
             scanned = scan(file.source, digests=True)
             if scanned.lost_bytes or edits_of(file, scanned) != [] or any(disagreements(file, scanned)):
                 return None

@@ -7,7 +7,7 @@ any length is streamed. https://arrow.apache.org/docs/python/data.html#record-ba
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -161,17 +161,9 @@ def _offsets(lengths: NDArray[np.int64]) -> pa.Array:
 
 def observed_flow(observations: Observations) -> pa.Table:
     """Observations with a row each, in the columns OBSERVED; what is not stated is empty."""
-    n = len(observations.position_um)
-    none = np.full((n, 2), np.nan)
-    rolled = observations.rolled_um_s if observations.rolled_um_s is not None else none
-    time_s = observations.time_s if observations.time_s is not None else none[:, 0]
-    parts = (observations.position_um, observations.flow_um_s, observations.std_um_s[:, None], rolled, time_s[:, None])
-    empty = {
-        "own_u_um_s": observations.rolled_um_s is None,
-        "own_v_um_s": observations.rolled_um_s is None,
-        "time_s": observations.time_s is None,
-    }
-    return _table(OBSERVED, np.hstack(parts), empty)
+    rolled = (None, None) if observations.rolled_um_s is None else observations.rolled_um_s.T
+    place, flow = observations.position_um.T, observations.flow_um_s.T
+    return _table(OBSERVED, (*place, *flow, observations.std_um_s, *rolled, observations.time_s))
 
 
 def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
@@ -181,18 +173,16 @@ def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
     ----------
     fluid : (h, w), where the chip holds fluid.
     """
-    return _table(VALUES, values_of(field, fluid), dict.fromkeys(("std_u_um_s", "std_v_um_s"), field.std_um_s is None))
+    columns = zip(VALUES, values_of(field, fluid).T, strict=True)
+    return _table(VALUES, [None if field.std_um_s is None and "std" in name else values for name, values in columns])
 
 
-def _table(columns: Mapping[str, str], values: NDArray[Any], empty: Mapping[str, bool]) -> pa.Table:
-    schema = pa.schema(
-        [
-            pa.field(name, pa.float64(), metadata={"unit": unit_of(name), "meaning": text})
-            for name, text in columns.items()
-        ]
-    )
-    arrays = [
-        pa.nulls(len(values), pa.float64()) if empty.get(name) else pa.array(np.ascontiguousarray(values[:, number]))
-        for number, name in enumerate(columns)
+def _table(meanings: Mapping[str, str], columns: Sequence[NDArray[Any] | None]) -> pa.Table:
+    """A table of numbers; a column that is None is empty."""
+    fields = [
+        pa.field(name, pa.float64(), metadata={"unit": unit_of(name), "meaning": text})
+        for name, text in meanings.items()
     ]
-    return pa.Table.from_arrays(arrays, schema=schema)
+    missing = [None] * next(len(each) for each in columns if each is not None)
+    arrays = [pa.array(missing if each is None else np.ascontiguousarray(each), pa.float64()) for each in columns]
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
