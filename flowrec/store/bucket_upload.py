@@ -170,13 +170,14 @@ class Bucket:
         made = self._ask(name, "put_object", len(data), Body=data, ContentMD5=md5, **condition)
         return None if made is None else _etag(made)
 
-    def upload(self, name: str, path: Path, progress: Callable[[int], None] = lambda _: None) -> Sent | None:
-        """Send a file; None if there is an object of that name already.
+    def upload(self, path: Path, progress: Callable[[int], None]) -> Sent | None:
+        """Send a file; None if there is an object of its name already.
 
         Parameters
         ----------
         progress : takes the bytes of the file that the bucket has.
         """
+        name = path.name
         with closing(LocalParts(path)) as parts:
             if parts.count > 1:
                 return _Upload(partial(self._ask, name), self._key(name), parts).run(progress)
@@ -258,28 +259,27 @@ class _Upload:
         named = [each for each in uploads if each["Key"] == self._key]
         newest = sorted(named, key=lambda each: str(each.get("Initiated")), reverse=True)
         for upload in newest[:_CANDIDATES]:
-            listed = dict(self._list_parts(upload))
-            fits = {number: etag for number, (size, etag) in listed.items() if self._is_part(number, size)}
+            upload_id: str = upload["UploadId"]
+            listed = dict(self._list_parts(upload_id))
+            fits = {
+                number: etag
+                for number, (size, etag) in listed.items()
+                if number <= self._parts.count and size == self._parts.length(number)
+            }
             if fits and fits[first := min(fits)] == _md5(self._parts.read(first)).hex():
                 self._there = fits
-                upload_id: str = upload["UploadId"]
                 return upload_id
         return None
 
-    def _list_parts(self, upload: Mapping[str, Any]) -> Iterator[tuple[int, tuple[int, str]]]:
+    def _list_parts(self, upload_id: str) -> Iterator[tuple[int, tuple[int, str]]]:
         marker: dict[str, int] = {}
         while True:
-            found = self._ask("list_parts", UploadId=upload["UploadId"], **marker)
-            if found is None:  # it has ended meanwhile
-                return
+            found = self._ask("list_parts", UploadId=upload_id, **marker) or {}  # none where it has ended meanwhile
             for part in found.get("Parts", []):
                 yield part["PartNumber"], (part["Size"], _etag(part))
             if not found.get("IsTruncated"):
                 return
             marker = {"PartNumberMarker": found["NextPartNumberMarker"]}
-
-    def _is_part(self, number: int, size: int) -> bool:
-        return number <= self._parts.count and size == self._parts.length(number)
 
     def _send(self, upload_id: str, number: int, data: bytes, md5: bytes) -> None:
         if self._stop.is_set():

@@ -54,7 +54,7 @@ class Entry(NamedTuple):
     start_unix_ns: int | None = None
 
     def without_image(self) -> Entry:
-        """The same, its image being left out and counted."""
+        """All of it but its image, which is counted as left out."""
         others = {name: message for name, message in self.messages.items() if name != "frame"}
         return self._replace(messages=others, dropped=self.dropped + 1)
 
