@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from flowrec.core import SessionError, UsageError, append_line, refuse_irregular
-from flowrec.store.byte_source import open_bytes
-from flowrec.store.session_path import UrlPath, on_this_machine
+from flowrec.store.byte_source import UrlPath, on_this_machine, open_bytes
 from flowrec.store.traffic import MissingError
 
 NOTES_SUFFIX = ".notes.jsonl"
@@ -53,7 +52,9 @@ def read_notes(session: Path, key: str) -> list[Note]:
     ------
     SessionError : the file can not be read.
     """
-    return [note for line in _lines(notes_content(notes_file(session))) if (note := _parse(line, key)) is not None]
+    lines = notes_content(notes_file(session)).split(b"\n")
+    notes = (_parse(line, key) for line in lines if 0 < len(line) <= _LINE_LIMIT)
+    return [note for note in notes if note is not None]
 
 
 def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
@@ -86,9 +87,8 @@ def notes_content(path: Path) -> bytes:
         try:
             with contextlib.closing(open_bytes(path)) as source:
                 return source.read(0, min(source.size, _FILE_LIMIT))
-        except (
-            MissingError
-        ):  # also where access is refused: S3 does not tell who may not list a bucket what is not there
+        # Also where access is refused: S3 does not tell who may not list a bucket what is not there.
+        except MissingError:
             return b""
     refuse_irregular(path, SessionError)
     try:
@@ -98,10 +98,6 @@ def notes_content(path: Path) -> bytes:
         return b""
     except OSError as error:
         raise SessionError(f"{path}: can not be read ({error.strerror}); check its permissions") from error
-
-
-def _lines(content: bytes) -> Iterator[bytes]:
-    return (line for line in content.split(b"\n") if 0 < len(line) <= _LINE_LIMIT)
 
 
 def _parse(line: bytes, key: str) -> Note | None:

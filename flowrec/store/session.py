@@ -24,10 +24,10 @@ from flowrec.core import (
     rows_for_people,
     seconds,
 )
+from flowrec.store.byte_source import session_path
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
-from flowrec.store.session_path import session_path
 
 if TYPE_CHECKING:
     import numpy as np
@@ -331,17 +331,13 @@ def input_blamed(session: Session, config: ResolvedConfig | None, done: str) -> 
 
 
 def _absurd_numbers(session: Session) -> Iterator[str]:
-    from flowrec.core import Tick, invalid_numbers, message_of
+    from flowrec.core import invalid_numbers
 
-    before = Tick()
-    for tick in session.ticks(with_frames=False):
-        for topic in session.reader.topics.topics:
-            message = message_of(tick, topic.field)
-            if message is not None and message is not message_of(before, topic.field):
-                for name in invalid_numbers(message, _LARGEST_NUMBER):
-                    at_s = seconds(tick.stamp_ns - session.run.first_ns)
-                    yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or an impossibly large number"
-        before = tick
+    for topic in session.reader.topics.topics:
+        for message in session.messages(topic.field) if topic.field != "frame" else ():
+            for name in invalid_numbers(message, _LARGEST_NUMBER):
+                at_s = seconds(message.stamp_ns - session.run.first_ns)
+                yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or an impossibly large number"
 
 
 def card(title: str, rows: Iterable[tuple[str, str]], image: NDArray[np.uint8 | np.uint16] | None) -> str:
