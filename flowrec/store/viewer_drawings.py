@@ -7,7 +7,6 @@ highest speed of the first field; solid is black.
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any
 
 import cv2
@@ -224,8 +223,3 @@ def _part(number: int, *content: bytes) -> Payload:
 
 
 _IN_CHIP = fg.PoseInFrame(frame_id=CHIP).encode()
-
-
-def is_finite(place: NDArray[np.float64]) -> bool:
-    """True if a place (2,) can be drawn on an image."""
-    return all(map(math.isfinite, place.tolist()))

@@ -197,7 +197,7 @@ class ViewerScene:
             field = messages.get(name)
             if isinstance(field, FlowField) and drawable(field):
                 if self.top_um_s is None:
-                    self.top_um_s = brightest_um_s(field)
+                    self.top_um_s = float(speed_um_s(field).max()) or 1.0
                 if name == "refined":
                     self._refined = field
                 if name == "refined" or self._refined is None:
@@ -251,8 +251,3 @@ def speed_um_s(field: FlowField) -> NDArray[np.float32]:
         speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
     np.nan_to_num(speed, copy=False, posinf=0.0)
     return speed
-
-
-def brightest_um_s(field: FlowField) -> float:
-    """The end of the colour scale of a session whose first field this is."""
-    return float(speed_um_s(field).max()) or 1.0
