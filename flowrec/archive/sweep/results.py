@@ -212,14 +212,14 @@ def _table(rows: Sequence[Row]) -> pa.Table:
     verdicts = {row["content"]: row for row in rows if row.get("verdict")}
     settings = list(dict.fromkeys(name for row in rows for name in row["settings"]))
     figures = list(dict.fromkeys(name for row in rows for name in row.get("figures", {})))
-    columns: dict[str, list[Any]] = {name: [row["settings"].get(name) for row in rows] for name in settings}
-    for name in figures:
-        for number, side in enumerate(_SIDES):
-            columns[side + name] = [row.get("figures", {}).get(name, (None, None))[number] for row in rows]
-    for name in COLUMNS:
-        judged = name in ("verdict", "findings")
-        columns[name] = [(verdicts.get(row["content"], row) if judged else row).get(name) for row in rows]
-    arrays = {name: array_of(columns[name]) for name in dict.fromkeys((*_FIRST, *columns))}
+    flat = []
+    for row in rows:
+        pairs = row.get("figures", {}).items()
+        sides = {side + name: value for name, pair in pairs for side, value in zip(_SIDES, pair, strict=True)}
+        judged = {name: verdicts.get(row["content"], row).get(name) for name in ("verdict", "findings")}
+        flat.append({**row, **row["settings"], **sides, **judged})
+    names = (*_FIRST, *settings, *(side + name for name in figures for side in _SIDES), *COLUMNS)
+    arrays = {name: array_of([row.get(name) for row in flat]) for name in dict.fromkeys(names)}
     fields = [
         pa.field(name, array.type, metadata={"unit": unit_of(name), "meaning": COLUMNS.get(name, "")})
         for name, array in arrays.items()
