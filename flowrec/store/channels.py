@@ -72,31 +72,25 @@ class Slot:
     metadata: dict[str, str]
 
 
-def message_codec(message_type: type[Any], schema_name: str = "", bits: int = 8) -> Codec:
+def message_codec(message_type: type[Any], schema_name: str = "", bits: int = 8, path: str = "") -> Codec:
     """The codec of any message type; of a Frame that of the schema, foxglove.RawImage where it is none of a Frame.
 
-    `bits` is the depth of the frames.
+    `bits` is the depth of the frames, `path` that of an extra topic, because packages may name types alike.
     """
     if message_type is Frame:
         return frame_codec(schema_name, bits)
-    return codec_of(message_type)
+    return codec_of(message_type, "" if message_type in _OWN_TYPES else path)
 
 
-def codec_of_extra(topic: Topic) -> Codec:
-    """The codec of a topic that is no field of `Tick`: of its path, because packages may name types alike."""
-    return codec_of(topic.type, "" if topic.type in _OWN_TYPES else topic.path)
-
-
-def _slots() -> Iterator[tuple[str, Slot]]:
+def _own_slots() -> Iterator[tuple[str, Slot]]:
     for number, topic in enumerate(TOPICS, 1):
-        group = FRAMES if topic.field == "frame" else STATE
+        group = FRAMES if topic.type is Frame else STATE
         yield topic.path, Slot(number, group, message_codec(topic.type).schema, {"role": topic.role.value})
     for number, view in enumerate(VIEWER_TOPICS, len(TOPICS) + 1):
-        metadata = {"role": "view", "made_from": view.source}
-        yield view.path, Slot(number, VIEW, view.schema, metadata)
+        yield view.path, Slot(number, VIEW, view.schema, {"role": "view", "made_from": view.source})
 
 
-SLOTS: dict[str, Slot] = dict(_slots())
+SLOTS: dict[str, Slot] = dict(_own_slots())
 VIEWED = frozenset(view.path for view in VIEWER_TOPICS)
 
 
@@ -107,14 +101,12 @@ def slots_of(topics: TopicTable) -> dict[str, Slot]:
     ------
     UsageError : an extra topic has the path of a viewer topic.
     """
-    if not topics.extra:
-        return SLOTS
     slots = dict(SLOTS)
     for number, topic in enumerate(topics.extra, len(SLOTS) + 1):
         if topic.path in SLOTS:
             raise UsageError(f"{topic.path}: is a topic of flowrec; choose another path")
         metadata = {"role": topic.role.value, _DECLARATION: declaration(topic)}
-        slots[topic.path] = Slot(number, STATE, codec_of_extra(topic).schema, metadata)
+        slots[topic.path] = Slot(number, STATE, message_codec(topic.type, path=topic.path).schema, metadata)
     return slots
 
 
@@ -265,9 +257,8 @@ class SessionContents(SessionMetadata):
         channel = self.channels[channel_number]
         found = self.schemas[channel.schema_id]
         topic = self.topics.by_path[channel.topic]
-        kind, extra = topic.type, topic in self.topics.extra
-        codec = codec_of_extra(topic) if extra else message_codec(kind, found.name, self.frame_bits)
-        self.codecs[channel_number] = codec
+        kind = topic.type
+        codec = self.codecs[channel_number] = message_codec(kind, found.name, self.frame_bits, topic.path)
         expected = codec.schema
         ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
         self.recorded_fields[self.fields[channel_number]] = ours_all

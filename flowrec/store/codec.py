@@ -13,7 +13,7 @@ import functools
 import json
 import math
 import operator
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from flowrec.core import (
     Level,
     MessageField,
     OperatorEvent,
+    RigError,
     SessionError,
     as_read,
     message_fields,
@@ -49,8 +50,6 @@ _UNCOPIED_BYTES = 1 << 14  # a larger array bypasses protobuf when it is written
 _LARGE_BYTES = 1 << 16  # in a larger message arrays bypass protobuf when it is read
 _FIELDS_LIMIT = 64  # protobuf parses a message with more fields
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
-# For lengths between these numpy converts quicker than a loop, but makes a list first.
-_SHORT_VECTOR, _LONG_VECTOR = 64, 1 << 16
 
 # Levels of foxglove.Log by Event.level; a level that is not listed is kept in the name.
 _LEVELS: dict[str, int] = {"debug": 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4, "fatal": 5}
@@ -142,7 +141,7 @@ def decode(
             message = codec.decode(payload, sequence)
             if start_unix_ns and codec.has_unix_time:
                 message = replace(message, stamp_ns=message.stamp_ns - start_unix_ns)
-    except (DecodeError, ValueError, TypeError, OverflowError) as error:
+    except (DecodeError, ValueError, TypeError, OverflowError, RigError) as error:  # the last: a level of an image
         raise SessionError(f"damaged {message_type.__name__}: {error}") from error
     return message
 
@@ -165,7 +164,9 @@ def byte_field_head(number: int, nbytes: int) -> bytes:
 
 
 def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes | memoryview, dict[int, memoryview]]:
-    """The message without some of its byte fields, and those fields by number, as views of the payload.
+    """The message without some of its byte fields, and those fields by number.
+
+    They are views of the payload, or copies where a view would keep a much larger buffer in memory.
 
     Raises
     ------
@@ -182,14 +183,10 @@ def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes
             found[number] = payload[value:end]
         else:
             rest.append(payload[begin:end])
-    return b"".join(rest), found
-
-
-def detach_fields(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int, memoryview]:
-    """The cut-out fields, copied where a view would keep a much larger buffer in memory."""
     buffer = payload.obj
-    copy = not isinstance(buffer, bytes | bytearray) or len(buffer) > 2 * sum(map(len, fields.values()))
-    return {number: memoryview(bytes(view)) if copy else view for number, view in fields.items()}
+    if not isinstance(buffer, bytes | bytearray) or len(buffer) > 2 * sum(map(len, found.values())):
+        found = {number: memoryview(bytes(view)) for number, view in found.items()}
+    return b"".join(rest), found
 
 
 def _without_surrogates(message: Any) -> Any:
@@ -244,7 +241,7 @@ def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memor
             parsed = parse(payload)
             return message_type(*[unpack(parsed) for unpack in unpack_all])
         rest, found = cut_byte_fields(memoryview(payload), arrays)
-        parsed, found = parse(rest), detach_fields(memoryview(payload), found)
+        parsed = parse(rest)
         return message_type(
             *[
                 _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)
@@ -280,10 +277,7 @@ def _unpacker(form: MessageField, vector_of: Callable[[Any], Any]) -> Callable[[
 
 
 def _vector(values: Any) -> NDArray[np.float64]:
-    count = len(values)
-    if _SHORT_VECTOR <= count <= _LONG_VECTOR:
-        return np.array(values, np.float64)
-    return np.fromiter(values, np.float64, count)
+    return np.fromiter(values, np.float64, len(values))
 
 
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:

@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from flowrec.core import Frame, Image, RigError, UsageError, pixel_type
-from flowrec.store.codec import Codec, Payload, byte_field_head, cut_byte_fields, detach_fields, stamp_of, timestamp
+from flowrec.core import Frame, Image, UsageError, pixel_type
+from flowrec.store.codec import Codec, Payload, byte_field_head, cut_byte_fields, stamp_of, timestamp
 from flowrec.store.schema import foxglove_schema
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -202,14 +202,14 @@ def _raw_image(bits: int) -> Codec:
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
         rest, found = cut_byte_fields(memoryview(payload), (_RAW_IMAGE_DATA,))
         parsed = schema.wire.FromString(rest)
-        data = detach_fields(memoryview(payload), found).get(_RAW_IMAGE_DATA, parsed.data)
+        data = found.get(_RAW_IMAGE_DATA, parsed.data)
         shape = parsed.height, parsed.width
         size = nbytes * shape[0] * shape[1]
         if parsed.encoding != name or parsed.step != nbytes * shape[1] or len(data) != size:
             raise ValueError(f"an image of {shape[1]} x {shape[0]} {parsed.encoding!r} in {len(data)} bytes")
         image = np.frombuffer(data, stored).reshape(shape)
         # A copy where the bytes begin at an odd address, for which no kernel is compiled.
-        return _frame(stamp_of(parsed), sequence, image.astype(pixel_type(bits), copy=not image.flags.aligned), bits)
+        return Frame(stamp_of(parsed), sequence, image.astype(pixel_type(bits), copy=not image.flags.aligned), bits)
 
     return Codec(schema, encode, decode, _sequence, has_unix_time=True)
 
@@ -229,16 +229,9 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload], bit
         rest, found = cut_byte_fields(memoryview(payload), (_COMPRESSED_IMAGE_DATA,))
         parsed = schema.wire.FromString(rest)
         image = decode_image(found.get(_COMPRESSED_IMAGE_DATA, parsed.data), bits)
-        return _frame(stamp_of(parsed), sequence, image, bits)
+        return Frame(stamp_of(parsed), sequence, image, bits)
 
     return Codec(schema, encode, decode, _sequence, has_unix_time=True)
-
-
-def _frame(stamp_ns: int, index: int, image: Image, bits: int) -> Frame:
-    try:
-        return Frame(stamp_ns, index, image, bits)
-    except RigError as error:  # a level beyond the depth
-        raise ValueError(str(error)) from error
 
 
 def _shape(frame: Frame, bits: int) -> tuple[int, int]:

@@ -90,7 +90,7 @@ class Tables:
         names = [each.name for each in message_fields(declared.type)]
         cells = dict(zip(names, zip(*rows, strict=True), strict=True))
         stamps = np.fromiter(cells[STAMP], np.int64, len(rows))
-        arrays, flat = [], dict[str, NDArray[Any]]()
+        arrays = []
         for column in columns:
             if column.name == STAMP:
                 array = pa.array(stamps)
@@ -100,13 +100,11 @@ class Tables:
                 none = np.full(len(rows), not self._start_unix_ns)
                 array = pa.array((stamps + self._start_unix_ns).view("datetime64[ns]"), _type_of(column), mask=none)
             elif column.component is not None:
-                if column.field not in flat:
-                    width = sum(other.field == column.field for other in columns)
-                    if {len(cell) for cell in cells[column.field]} != {width}:
-                        what = f"{declared.path}: {column.field}"
-                        raise SessionError(f"{what} has not {width} numbers in each message, one a coil")
-                    flat[column.field] = _flat(cells[column.field], column.kind).reshape(len(rows), width)
-                array = pa.array(np.ascontiguousarray(flat[column.field][:, column.component]))
+                width = sum(other.field == column.field for other in columns)
+                if set(map(len, cells[column.field])) != {width}:
+                    what = f"{declared.path}: {column.field}"
+                    raise SessionError(f"{what} has not {width} numbers in each message, one a coil")
+                array = pa.array([cell[column.component] for cell in cells[column.field]], _type_of(column))
             elif column.shape:
                 array = _lists(column, cells[column.field])
             else:
