@@ -13,13 +13,15 @@ import threading
 import weakref
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from flowrec.core import SessionError, UsageError, refuse_irregular
 
 # A path keeps one slash of the two after the scheme; `az` is Azure, `gs` Google.
 _URL = re.compile(r"(s3|gs|az|https?):/{1,2}(?=[^/])", re.IGNORECASE)
 if TYPE_CHECKING:
+    from flowrec.store.remote_file import RemoteFile
+
     _LocalPath = Path
 else:
     _LocalPath = type(Path())
@@ -70,35 +72,13 @@ def named_beside(session: Path, name: str) -> Path:
     return Path(name) if isinstance(session_path(session), UrlPath) else session.with_name(name)
 
 
-class ByteSource(Protocol):
-    """Bytes that can be read by range, from several threads at a time.
+class LocalFile:
+    """A file on this machine, whose bytes are read by range, from several threads at a time; see RemoteFile, too.
 
     Attributes
     ----------
     path : its name, for messages.
     size : number of bytes when it was opened.
-    """
-
-    path: Path
-    size: int
-
-    def read(self, offset: int, length: int) -> bytes:
-        """The bytes of a range that lies within `size`; fewer where the source has become shorter.
-
-        Raises
-        ------
-        SessionError : it can not be read, or has been closed.
-        """
-
-    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Ranges (offset, length) that will be read soon, each once; a hint, which may do nothing."""
-
-    def close(self) -> None:
-        """Release it; garbage collection releases it, too."""
-
-
-class LocalFile:
-    """A file on this machine.
 
     Raises
     ------
@@ -123,6 +103,12 @@ class LocalFile:
         self.size = os.fstat(self._descriptor).st_size
 
     def read(self, offset: int, length: int) -> bytes:
+        """The bytes of a range that lies within `size`; fewer where the file has become shorter.
+
+        Raises
+        ------
+        SessionError : it can not be read, or has been closed.
+        """
         if not self._closer.alive:
             raise SessionError(f"{self.path}: has been closed; open the session again")
         data = b""
@@ -146,13 +132,14 @@ class LocalFile:
         return data
 
     def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        pass  # the operating system reads ahead
+        """Ranges (offset, length) that will be read soon, each once: the operating system reads ahead by itself."""
 
     def close(self) -> None:
+        """Release it; garbage collection releases it, too."""
         self._closer()
 
 
-def open_bytes(path: Path) -> ByteSource:
+def open_bytes(path: Path) -> LocalFile | RemoteFile:
     """The bytes that a path or URL names.
 
     Raises
