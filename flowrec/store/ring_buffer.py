@@ -164,7 +164,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         if self._free:
             encoder = self._free.pop()
         else:
-            encoder = self._encoder(_discard)
+            encoder = self._encoder(lambda _chunks: None)  # until a segment uses it
             encoder.sequences = self._sequences
         return _RingSegment(encoder, dict(self._state), self._last_ns)
 
@@ -275,7 +275,3 @@ class SnapshotTrigger:
                 self._dropped, self._dropped_ns = dropped, stamp_ns
                 return "images are lost" if began else ""
         return ""
-
-
-def _discard(_chunks: list[SealedChunk]) -> None:
-    """The sink of an encoder that no segment uses yet."""

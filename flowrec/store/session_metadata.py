@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 from mcap.records import Attachment, Metadata, Statistics
 
@@ -59,7 +59,7 @@ class Part:
 
     run: str
     number: int
-    kind: Literal["part", "snapshot"] = "part"
+    kind: str = "part"
     keyframe_ns: int | None = None
     why: str = ""
 
@@ -281,5 +281,4 @@ def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
     if kind not in ("part", "snapshot") or not are_numbers or max(len(number), len(keyframe)) >= _DIGITS:
         what = f"{kind[:40]!r} {number[:40]!r}, carried from {keyframe[:40]!r}"
         raise ValueError(f"a record of a part with invalid values: {what}")
-    kind_of: Literal["part", "snapshot"] = "part" if kind == "part" else "snapshot"
-    return Part(facts.get("run", ""), int(number), kind_of, int(keyframe) if keyframe else None, facts.get("why", ""))
+    return Part(facts.get("run", ""), int(number), kind, int(keyframe) if keyframe else None, facts.get("why", ""))

@@ -43,7 +43,8 @@ _COMMON = {
     TIME: ("float64", "the same in s, as in Session.at"),
     WALL: ("timestamp", "the same as time of day, UTC; empty in files that do not state when their clock was 0"),
 }
-_READ_WITH_PIXELS: dict[type, tuple[str, ...]] = {Frame: ("index", "image")}
+
+_READ_WITH_PIXELS = ("index", "image")  # of a Frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,7 @@ def columns_of(topic: str, topics: TopicTable = FIXED, coils: int = 3) -> tuple[
 def _columns_of_type(topic: str, message_type: type, coils: int) -> tuple[Column, ...]:
     columns = [Column(name, "", None, kind, (), unit_of(name), text) for name, (kind, text) in _COMMON.items()]
     for each in message_fields(message_type):
-        if each.name not in (STAMP, *_READ_WITH_PIXELS.get(message_type, ())):
+        if each.name != STAMP and (message_type is not Frame or each.name not in _READ_WITH_PIXELS):
             columns += _columns(each, coils)
     # A field that is called like a column of every table: the times of observations.
     return tuple(
