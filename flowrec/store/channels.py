@@ -212,7 +212,6 @@ class SessionContents(SessionMetadata):
         SessionError : it is damaged.
         """
         kind = self.topics.by_field[self.fields[record.channel]].type
-        assert isinstance(record.payload, memoryview)
         codec, start_unix_ns = self.codecs[record.channel], self.source.start_unix_ns
         message = decode(kind, codec, record.payload, record.sequence, start_unix_ns)
         if fault := shape_error(message):
@@ -240,7 +239,7 @@ class SessionContents(SessionMetadata):
 
         def small(record: Record) -> Row:
             payload = record.payload
-            if len(payload) > _SMALL_BYTES:  # type: ignore[arg-type]  # a memoryview here
+            if len(payload) > _SMALL_BYTES:
                 return whole(record)
             try:
                 parsed = parse(payload)

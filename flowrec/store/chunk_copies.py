@@ -224,7 +224,6 @@ class ChunkCopier:
         indexes = MessageIndexes()
         at, start_unix_ns = 0, self._source.start_unix_ns
         for log_ns, channel, sequence, payload in records:
-            assert isinstance(payload, memoryview)
             indexes.add(channel, sequence, log_ns + start_unix_ns, at, payload)
             at += _MESSAGE_BYTES + len(payload)
         body = self._source.body(place.chunk_start_offset, place.chunk_length, Opcode.CHUNK)

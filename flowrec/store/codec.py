@@ -67,14 +67,12 @@ class Codec:
     schema : protobuf schema of the payload.
     encode : message -> parts of the payload, in order; large arrays are not copied.
     decode : payload, MCAP sequence -> message.
-    sequence : message -> the MCAP sequence that it must have; None: the writer counts.
     has_unix_time : the schema is one of foxglove's, whose `timestamp` is Unix time; flowrec's own have stamps.
     """
 
     schema: Schema
     encode: Callable[[Any], Payload]
     decode: Callable[[bytes | memoryview, int], Any]
-    sequence: Callable[[Any], int] | None = None
     has_unix_time: bool = False
 
 
@@ -111,7 +109,7 @@ def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> Encoded
     if start_unix_ns and codec.has_unix_time:
         message = replace(message, stamp_ns=stamp_ns + start_unix_ns)
     try:
-        sequence = codec.sequence(message) if codec.sequence is not None else None
+        sequence = message.index if isinstance(message, Frame) else None
         try:
             return Encoded(stamp_ns, sequence, codec.encode(message))
         except UnicodeEncodeError:
@@ -304,7 +302,7 @@ def _event_codec() -> Codec:
     def encode(event: Event) -> Payload:
         level = _LEVELS.get(event.level, 0)
         name = _EVENT_NAME if level else f"{_EVENT_NAME}.{event.level}"
-        return _log(schema, event.stamp_ns, level, event.text, name)
+        return _log(event.stamp_ns, level, event.text, name)
 
     def decode(payload: bytes | memoryview, _sequence: int) -> Event:
         parsed = schema.wire.FromString(payload)
@@ -327,7 +325,7 @@ def _operator_codec() -> Codec:
         text, name = f"{event.action}: {event.text}", _OPERATOR_NAME + event.action
         numbers: dict[str, Any] = {"goal_um": event.goal_um.tolist(), "speed_limit_um_s": event.speed_limit_um_s}
         stated = {key: value for key, value in numbers.items() if value not in ([], None)}
-        return _log(schema, event.stamp_ns, _LEVELS[Level.INFO], text, name, json.dumps(stated) if stated else "")
+        return _log(event.stamp_ns, _LEVELS[Level.INFO], text, name, json.dumps(stated) if stated else "")
 
     def decode(payload: bytes | memoryview, _sequence: int) -> OperatorEvent:
         parsed = schema.wire.FromString(payload)
@@ -353,8 +351,8 @@ def _operator_numbers(text: str) -> dict[str, Any]:
     return numbers
 
 
-def _log(schema: Schema, stamp_ns: int, level: int, text: str, name: str, file: str = "") -> Payload:
-    log = schema.wire(timestamp=timestamp(stamp_ns), level=level, message=text, name=name, file=file)
+def _log(stamp_ns: int, level: int, text: str, name: str, file: str = "") -> Payload:
+    log = foxglove_schema("Log").wire(timestamp=timestamp(stamp_ns), level=level, message=text, name=name, file=file)
     return (log.SerializeToString(),)
 
 

@@ -211,7 +211,7 @@ def _raw_image(bits: int) -> Codec:
         # A copy where the bytes begin at an odd address, for which no kernel is compiled.
         return Frame(stamp_of(parsed), sequence, image.astype(pixel_type(bits), copy=not image.flags.aligned), bits)
 
-    return Codec(schema, encode, decode, _sequence, has_unix_time=True)
+    return Codec(schema, encode, decode, has_unix_time=True)
 
 
 def _compressed_image(file_format: str, file_of: Callable[[Image], Payload], bits: int) -> Codec:
@@ -231,22 +231,18 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload], bit
         image = decode_image(found.get(_COMPRESSED_IMAGE_DATA, parsed.data), bits)
         return Frame(stamp_of(parsed), sequence, image, bits)
 
-    return Codec(schema, encode, decode, _sequence, has_unix_time=True)
+    return Codec(schema, encode, decode, has_unix_time=True)
 
 
 def _shape(frame: Frame, bits: int) -> tuple[int, int]:
     if frame.bits != bits:
         raise ValueError(f"an image of {frame.bits} bit in a session of {bits} bit; set camera.bits to {frame.bits}")
+    if not 0 <= frame.index < _SEQUENCE_LIMIT:
+        raise ValueError(f"frame index {frame.index} is not in 32 bit")
     if frame.image.size > PIXELS_LIMIT:
         raise ValueError(f"an image of {frame.image.size} pixels, more than {PIXELS_LIMIT}, which the reader takes")
     height, width = frame.image.shape
     return height, width
-
-
-def _sequence(frame: Frame) -> int:
-    if not 0 <= frame.index < _SEQUENCE_LIMIT:
-        raise ValueError(f"frame index {frame.index} is not in 32 bit")
-    return frame.index
 
 
 @functools.cache

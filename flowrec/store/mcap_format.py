@@ -10,7 +10,7 @@ import io
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -24,9 +24,6 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-
-if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
-    from flowrec.core import Message
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -54,7 +51,7 @@ class Record(NamedTuple):
     log_ns: int
     channel: int
     sequence: int
-    payload: memoryview | Message  # a message where it has been decoded already
+    payload: Any  # a memoryview, or a message where it has been decoded already
 
 
 class ChannelIndex(NamedTuple):
