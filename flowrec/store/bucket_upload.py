@@ -219,7 +219,7 @@ class _Upload:
     def __init__(self, ask: Callable[..., Any], key: str, parts: LocalParts) -> None:
         self._ask, self._key, self._parts = ask, key, parts
         self._there: dict[int, str] = {}  # ETags by number
-        self._sending: dict[Future[None], int] = {}
+        self._sending: set[Future[int]] = set()
         self._stop = threading.Event()
         self._sent_bytes = self._done_bytes = 0
 
@@ -233,11 +233,9 @@ class _Upload:
                     self._done_bytes += len(data)
                     progress(self._done_bytes)
                     continue
-                while len(self._sending) >= _TOGETHER:
-                    self._wait(progress)
-                self._sending[threads.submit(self._send, upload_id, number, data, md5)] = len(data)
-            while self._sending:
-                self._wait(progress)
+                self._wait(_TOGETHER - 1, progress)
+                self._sending.add(threads.submit(self._send, upload_id, number, data, md5))
+            self._wait(0, progress)
         finally:
             self._stop.set()
             threads.shutdown(wait=False, cancel_futures=True)
@@ -260,45 +258,44 @@ class _Upload:
         newest = sorted(named, key=lambda each: str(each.get("Initiated")), reverse=True)
         for upload in newest[:_CANDIDATES]:
             upload_id: str = upload["UploadId"]
-            listed = dict(self._list_parts(upload_id))
             fits = {
-                number: etag
-                for number, (size, etag) in listed.items()
-                if number <= self._parts.count and size == self._parts.length(number)
+                number: _etag(part)
+                for part in self._list_parts(upload_id)
+                if (number := part["PartNumber"]) <= self._parts.count and part["Size"] == self._parts.length(number)
             }
             if fits and fits[first := min(fits)] == _md5(self._parts.read(first)).hex():
                 self._there = fits
                 return upload_id
         return None
 
-    def _list_parts(self, upload_id: str) -> Iterator[tuple[int, tuple[int, str]]]:
+    def _list_parts(self, upload_id: str) -> Iterator[Mapping[str, Any]]:
         marker: dict[str, int] = {}
         while True:
             found = self._ask("list_parts", UploadId=upload_id, **marker) or {}  # none where it has ended meanwhile
-            for part in found.get("Parts", []):
-                yield part["PartNumber"], (part["Size"], _etag(part))
+            yield from found.get("Parts", [])
             if not found.get("IsTruncated"):
                 return
             marker = {"PartNumberMarker": found["NextPartNumberMarker"]}
 
-    def _send(self, upload_id: str, number: int, data: bytes, md5: bytes) -> None:
+    def _send(self, upload_id: str, number: int, data: bytes, md5: bytes) -> int:
         if self._stop.is_set():
-            return
+            return 0
         digest = base64.b64encode(md5).decode()
         words = {"UploadId": upload_id, "PartNumber": number, "Body": data, "ContentMD5": digest}
         sent = self._ask("upload_part", len(data), lambda: not self._stop.is_set(), **words)
         if sent is None:
             raise StoreError(f"{self._parts.path}: its upload was ended by somebody else; the same command goes on")
         self._there[number] = _etag(sent)
+        return len(data)
 
-    def _wait(self, progress: Callable[[int], None]) -> None:
-        """Until a part was sent; its error is raised here."""
-        for future in wait(self._sending, return_when=FIRST_COMPLETED).done:
-            length = self._sending.pop(future)
-            future.result()
-            self._sent_bytes += length
-            self._done_bytes += length
-            progress(self._done_bytes)
+    def _wait(self, left: int, progress: Callable[[int], None]) -> None:
+        """Until so many parts are left that are being sent; the error of a part is raised here."""
+        while len(self._sending) > left:
+            sent, self._sending = wait(self._sending, return_when=FIRST_COMPLETED)
+            for length in (future.result() for future in sent):
+                self._sent_bytes += length
+                self._done_bytes += length
+                progress(self._done_bytes)
 
 
 def _ours(error: Exception) -> Exception | None:
