@@ -58,9 +58,6 @@ _OWN_TYPES = frozenset(topic.type for topic in TOPICS)
 _DECLARATION = "declaration"  # in the metadata of the channel of an extra topic
 _BITS = "bits"  # in the metadata of the frames' channel: depth of the images; 8 where it is not stated
 
-# A replay continues from what the stages recorded; without images it takes the tracks as they were recorded.
-_NEEDED = {topic.path for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {FRAME_PATH}
-
 
 @dataclass(frozen=True, slots=True)
 class Slot:
@@ -141,7 +138,8 @@ def left_out(patterns: Iterable[str], topics: TopicTable = FIXED) -> frozenset[s
     UsageError : a pattern matches no topic, or one without which the session could not be replayed.
     """
     chosen: set[str] = set()
-    needed_ones = _NEEDED | {topic.path for topic in topics.extra if topic.role in (Role.INPUT, Role.OUTPUT)}
+    # A replay continues from what the stages recorded; without images it takes the tracks as they were recorded.
+    needed_ones = {topic.path for topic in topics.topics if topic.role in (Role.INPUT, Role.OUTPUT)} - {FRAME_PATH}
     for pattern in patterns:
         found = {path for path in slots_of(topics) if is_left_out(path, [pattern])}
         found |= {path for path in VIEWED if is_left_out(f"/view{path}", [pattern])}

@@ -84,16 +84,12 @@ class GrowingRun:
     @cached_property
     def config(self) -> ResolvedConfig:
         """The configuration of the run."""
-        from flowrec.stages import config_from_toml
-
-        return config_from_toml(self.header.config_toml, f"{self.path}: config.toml inside", self.header.provenance)
+        return self.header.config(f"{self.path}: config.toml inside")
 
     @cached_property
     def chip(self) -> Chip:
         """The chip."""
-        from flowrec.physics import chip_from_files
-
-        return chip_from_files(self.header.chip_png, self.header.chip_toml)
+        return self.header.chip()
 
     def ticks(self) -> Iterator[Tick]:
         """The ticks as they come, from the beginning of the present file to the end of the run.

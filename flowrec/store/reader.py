@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import COILS, Frame, SessionError, Tick, array_shapes, seconds
-from flowrec.store.byte_source import is_there, session_path
+from flowrec.store.byte_source import session_path
 from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
-from flowrec.store.run_files import Run, RunFile
+from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader
 
 _OPEN_FILES = 4
@@ -32,6 +32,7 @@ class SessionReader:
     Parameters
     ----------
     path : the session.
+    run : its files, where they are known already.
 
     Attributes
     ----------
@@ -53,16 +54,12 @@ class SessionReader:
         whole run; on reading, damage.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, run: Run | None = None) -> None:
         self.path = session_path(path)
+        self._run = run or Run.at(self.path)
         self._cache: Cache = {}
         self._closed = False
         self._open: dict[int, FileReader] = {}  # the one that was used longest ago first
-        if is_there(self.path):
-            self._open[0] = FileReader(self.path, self._cache)
-            self._run = Run(self.path, [RunFile.of(self._open[0])])
-        else:
-            self._run = Run.at(self.path)
         self.files = [file.path for file in self._run.files]
         self.part = self._run.part
         self.keyframe_ns = self.part.keyframe_ns if self.part is not None else None

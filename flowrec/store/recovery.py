@@ -178,8 +178,8 @@ def _recover(path: Path, out: Path | None) -> Recovered:
     try:
         with contents:
             kept = _copy_intact(contents, draft)
-        done = _verify(draft)
-        if done is None:
+        duration_s = _verify(draft)
+        if duration_s is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
         _refuse_if_taken(target)
         _rename(draft, target)
@@ -193,7 +193,7 @@ def _recover(path: Path, out: Path | None) -> Recovered:
             draft.unlink(missing_ok=True)
     if partial and target == final:
         path.unlink()
-    return Recovered(target, kept.ticks, done.duration_s, kept.lost_bytes, kept.lost)
+    return Recovered(target, kept.ticks, duration_s, kept.lost_bytes, kept.lost)
 
 
 def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
@@ -223,12 +223,8 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
 
 def _left_out(contents: SessionContents) -> frozenset[str]:
     """The topics that the run was not to record; none where its settings can not be read."""
-    from flowrec.stages import config_from_toml
-
     try:
-        header = contents.header
-        config = config_from_toml(header.config_toml, "config.toml", header.provenance)
-        return left_out(config.recording.leave_out, contents.topics)
+        return left_out(contents.header.config().recording.leave_out, contents.topics)
     except FlowrecError:
         return frozenset()
 
@@ -253,15 +249,15 @@ def _check_intact(path: Path) -> Recovered | None:
         return None
 
 
-def _verify(draft: Path) -> Recovered | None:
-    """A file that was just written; None unless every message is as it was meant, and the index agrees with them."""
+def _verify(draft: Path) -> float | None:
+    """Length in s of a new file; None unless every message is as it was meant, and the index agrees with them."""
     try:
         with SessionReader(draft) as reader:
             file, _ = reader.file(0), reader.header
             scanned = scan(file.source, digests=True)
             if scanned.lost_bytes or edits_of(file, scanned) != [] or any(disagreements(file, scanned)):
                 return None
-            return Recovered(draft, reader.counts.get("track", 0), reader.duration_s)
+            return reader.duration_s
     except SessionError:
         return None
 

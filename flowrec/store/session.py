@@ -120,17 +120,12 @@ class Session:
     @cached_property
     def config(self) -> ResolvedConfig:
         """The resolved configuration of the run; UsageError where it is not valid."""
-        from flowrec.stages import config_from_toml
-
-        where = f"{self.path}: config.toml inside"
-        return config_from_toml(self.header.config_toml, where, self.header.provenance)
+        return self.header.config(f"{self.path}: config.toml inside")
 
     @cached_property
     def chip(self) -> Chip:
         """The chip with its mask (h, w) and openings; ChipError where it is not valid."""
-        from flowrec.physics import chip_from_files
-
-        return chip_from_files(self.header.chip_png, self.header.chip_toml)
+        return self.header.chip()
 
     @cached_property
     def calibration(self) -> Calibration:
@@ -144,7 +139,7 @@ class Session:
         """The reader of the messages, by stamps in ns."""
         from flowrec.store.reader import SessionReader
 
-        return SessionReader(self.path)
+        return SessionReader(self.path, self.run)
 
     def ticks(self, start_s: float | None = None, *, with_frames: bool = True) -> Iterator[Tick]:
         """All ticks, or those at and after `start_s`, each with every message known by then.

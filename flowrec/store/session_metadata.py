@@ -10,13 +10,17 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from mcap.records import Attachment, Metadata, Statistics
 
 from flowrec.core import SessionError, __version__
 from flowrec.store.mcap_format import Summary
 from flowrec.store.mcap_reader import ForeignError, McapReader
+
+if TYPE_CHECKING:
+    from flowrec.physics import Chip
+    from flowrec.stages import ResolvedConfig
 
 FORMAT_VERSION = 1
 PROFILE = "flowrec"
@@ -91,6 +95,18 @@ class SessionHeader:
     part: Part | None = None
     start_unix_ns: int = 0
     pictures: Mapping[str, bytes] = field(default_factory=dict)
+
+    def config(self, where: str = "config.toml") -> ResolvedConfig:
+        """The resolved configuration; UsageError, which begins with `where`, if it is not valid."""
+        from flowrec.stages import config_from_toml
+
+        return config_from_toml(self.config_toml, where, self.provenance)
+
+    def chip(self) -> Chip:
+        """The chip with its mask (h, w) and openings; ChipError if it is not valid."""
+        from flowrec.physics import chip_from_files
+
+        return chip_from_files(self.chip_png, self.chip_toml)
 
     def is_same_run(self, other: SessionHeader) -> bool:
         """True if two headers differ in their part at most."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import M_PER_UM, Estimate, FlowField, Route, Track
 from flowrec.store.codec import Payload, byte_field_head
-from flowrec.store.viewer_scene import CHIP, MAP, Picture, ViewerScene, speed_um_s
+from flowrec.store.viewer_scene import CHIP, MAP, STILL, Picture, ViewerScene, speed_um_s
 
 _GRID_DATA, _CIRCLES, _POINTS, _TRANSFORMS = 9, 1, 2, 1  # numbers of fields
 # The robot and the goal are drawn as rings: a single point of Rerun's default size is hidden by the path.
@@ -149,7 +149,7 @@ def grid(field: FlowField, _scene: ViewerScene) -> Payload:
 
 def _pose(x_um: float, y_um: float) -> fg.Pose:
     place = fg.Vector3(x=M_PER_UM * x_um, y=M_PER_UM * y_um, z=0.0)
-    return fg.Pose(position=place, orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+    return fg.Pose(position=place, orientation=STILL)
 
 
 @functools.lru_cache(maxsize=2)  # asked for twice
