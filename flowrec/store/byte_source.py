@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flowrec.core import SessionError, UsageError, refuse_irregular
+from flowrec.store.traffic import MissingError
 
 # A path keeps one slash of the two after the scheme; `az` is Azure, `gs` Google.
 _URL = re.compile(r"(s3|gs|az|https?):/{1,2}(?=[^/])", re.IGNORECASE)
@@ -93,7 +94,7 @@ class LocalFile:
             refuse_irregular(path, SessionError)
             self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         except FileNotFoundError as error:
-            raise SessionError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
+            raise MissingError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
         except ValueError as error:  # a name with a NUL, which only another file can have given
             raise SessionError(f"{path}: is not the name of a file") from error
         except OSError as error:

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flowrec.core import SessionError, UsageError, append_line, refuse_irregular
-from flowrec.store.byte_source import UrlPath, on_this_machine, open_bytes
+from flowrec.store.byte_source import on_this_machine, open_bytes
 from flowrec.store.traffic import MissingError
 
 NOTES_SUFFIX = ".notes.jsonl"
@@ -83,21 +83,12 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
 
 def notes_content(path: Path) -> bytes:
     """The bytes of a file of notes; none where there is no file. SessionError if it can not be read."""
-    if isinstance(path, UrlPath):
-        try:
-            with contextlib.closing(open_bytes(path)) as source:
-                return source.read(0, min(source.size, _FILE_LIMIT))
-        # Also where access is refused: S3 does not tell who may not list a bucket what is not there.
-        except MissingError:
-            return b""
-    refuse_irregular(path, SessionError)
     try:
-        with path.open("rb") as file:
-            return file.read(_FILE_LIMIT)
-    except FileNotFoundError:
+        with contextlib.closing(open_bytes(path)) as source:
+            return source.read(0, min(source.size, _FILE_LIMIT))
+    # Also where access to a URL is refused: S3 does not tell who may not list a bucket what is not there.
+    except MissingError:
         return b""
-    except OSError as error:
-        raise SessionError(f"{path}: can not be read ({error.strerror}); check its permissions") from error
 
 
 def _parse(line: bytes, key: str) -> Note | None:

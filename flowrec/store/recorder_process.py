@@ -1,4 +1,4 @@
-"""The recorder in a process of its own: it outlives the run, and finishes the files however that has ended.
+"""The recorder of a run: a thread, or a process of its own that finishes the files however the run has ended.
 
 The run puts entries into two rings in shared memory (shared_queue.py); the process takes them. When the process of the
 run has ended, killed or not, its pipe is closed: the recorder then writes what is left in the rings and completes the

@@ -145,7 +145,7 @@ def _lists(column: Column, cells: tuple[Any, ...]) -> pa.Array:
     missing = np.array([cell is None for cell in cells])
     outer = column.shape[0]
     if isinstance(outer, int):
-        assert not missing.any()  # see columns.py
+        assert not missing.any()  # see table_columns.py
         return pa.FixedSizeListArray.from_arrays(values, outer)
     lengths = np.zeros(len(cells), np.int64)
     lengths[~missing] = shapes[:, 0]
