@@ -128,15 +128,15 @@ class RecorderProcess:
         except OSError as error:
             raise SessionError(f"{plan.path}: its recorder does not start ({error})") from error
         try:
-            self._child.send((_portable(plan), self.queue.handles, plan.options.block))
+            self._child.send((_portable(plan), self.queue.handles))
             assert self._child.process.stdin is not None
             self.queue.wake_by(self._child.process.stdin.fileno())
-            kind, reason = self._child.receive()
+            refusal: str = self._child.receive()
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             raise SessionError(f"{plan.path}: its recorder does not start ({self._cause()})") from error
-        if kind != "ready":
+        if refusal:
             self._close()
-            raise SessionError(reason)
+            raise SessionError(refusal)
         self._listener = threading.Thread(target=self._listen, name="recorder", daemon=True)
         self._listener.start()
 
@@ -185,14 +185,9 @@ class RecorderProcess:
         kind, value = answer
         if kind == "remark":
             self.remarks.append(value)
-        elif kind == "refused":
-            self.failure = SessionError(value)
-        elif kind == "failed":
-            self.failure = RuntimeError(value)
         else:
-            self.files, self.partial_path, self.dropped, failed = value
-            if failed is not None:
-                self._take(failed)
+            self.files, self.partial_path, self.dropped, failure = value
+            self.failure = failure or self.failure
             self._ended.set()
 
     def _cause(self) -> str:
@@ -223,27 +218,27 @@ def _work() -> None:
         signal.signal(each, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed does not get between the answers
-    (plan, topics), handles, low = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+    (plan, topics), handles = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
     table = TopicTable(declared_topic(path, text) for path, text in topics)
     plan = replace(plan, options=replace(plan.options, topics=table))
-    if low and sys.platform == "linux":
+    if plan.options.block and sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     queue = QueueReader(handles, sys.stdin.fileno())
     try:
-        recorder = _files_of(plan, lambda text: _answer(answers, "remark", text))
+        recorder = _files_of(plan, lambda text: _answer(answers, ("remark", text)))
     except SessionError as error:
-        _answer(answers, "refused", str(error))
+        _answer(answers, str(error))
         return
-    _answer(answers, "ready", None)
-    failed: tuple[str, str] | None = None
+    _answer(answers, "")
+    failure: Exception | None = None
     try:
         threading.Thread(target=_work_beside, args=(recorder, queue), daemon=True).start()
         recorder.record(queue)
     except SessionError as error:
-        failed = "refused", str(error)
+        failure = SessionError(str(error))  # others may not be pickled
     except Exception as error:  # noqa: BLE001  the run raises it
-        failed = "failed", f"{type(error).__name__}: {error}"
-    _answer(answers, "ended", (recorder.files, recorder.partial_path, recorder.dropped, failed))
+        failure = RuntimeError(f"{type(error).__name__}: {error}")
+    _answer(answers, ("ended", (recorder.files, recorder.partial_path, recorder.dropped, failure)))
 
 
 def _work_beside(recorder: Parts | RingBuffer, queue: QueueReader) -> None:
@@ -260,9 +255,9 @@ def _work_beside(recorder: Parts | RingBuffer, queue: QueueReader) -> None:
         time.sleep(_REPORT_S)
 
 
-def _answer(answers: IO[bytes], kind: str, value: object) -> None:
+def _answer(answers: IO[bytes], value: object) -> None:
     with contextlib.suppress(BrokenPipeError):  # the run has ended: nobody asks
-        answers.write(pickle.dumps((kind, value)))
+        answers.write(pickle.dumps(value))
         answers.flush()
 
 
