@@ -188,11 +188,12 @@ def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes
 
 
 def _without_surrogates(message: Any) -> Any:
-    changes = {}
-    for form in message_fields(type(message)):
-        value = getattr(message, form.name)
-        changes[form.name] = value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
-    return type(message)(**changes)
+    changes = {
+        form.name: value.encode("utf-8", "backslashreplace").decode()
+        for form in message_fields(type(message))
+        if isinstance(value := getattr(message, form.name), str)
+    }
+    return replace(message, **changes)
 
 
 def _encoder(message_type: type[Any], schema: Schema) -> Callable[[Any], Payload]:

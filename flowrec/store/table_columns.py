@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -101,7 +101,8 @@ def _columns(field: MessageField, coils: int) -> list[Column]:
     of_coils = shape == (COILS,) and field.kind == "vector"
     shape = (coils,) if of_coils else shape
     if len(shape) == 1 and (shape[0] in (2, 3) or of_coils) and not field.optional:
-        parts = _AXES[: int(shape[0])] if int(shape[0]) in (2, 3) else [str(coil + 1) for coil in range(coils)]
+        count = int(shape[0])
+        parts: Iterable[str | int] = _AXES[:count] if count in (2, 3) else range(1, count + 1)
         suffix = unit_suffix(field.name)
         stem = field.name.removesuffix(suffix)
         return [

@@ -6,7 +6,6 @@ any length is streamed. https://arrow.apache.org/docs/python/data.html#record-ba
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -120,20 +119,13 @@ def _type_of(column: Column) -> pa.DataType:
     return kind
 
 
-def _flat(cells: tuple[Any, ...], kind: str) -> NDArray[Any]:
-    """All elements of vectors or arrays one after the other; a vector is a tuple."""
-    if cells and isinstance(cells[0], tuple):
-        return np.fromiter(itertools.chain.from_iterable(cells), kind)
-    return np.concatenate([np.ravel(cell) for cell in cells]) if cells else np.zeros(0, kind)
-
-
 def _lists(column: Column, cells: tuple[Any, ...]) -> pa.Array:
     """Arrays of one number of dimensions and of any shape, None among them, as nested lists without a copy a number."""
     there = [cell for cell in cells if cell is not None]
-    shapes = np.array([(len(cell),) if isinstance(cell, tuple) else cell.shape for cell in there], np.int64)
+    shapes = np.array([np.shape(cell) for cell in there], np.int64)
     axes = len(column.shape)
     shapes = shapes.reshape(len(there), axes)  # also where there is none
-    values = pa.array(_flat(tuple(there), column.kind))
+    values = pa.array(np.concatenate([np.zeros(0, column.kind), *map(np.ravel, there)]))
     for axis in reversed(range(1, axes)):  # from the innermost lists to those of which a row has one
         length = column.shape[axis]
         if isinstance(length, int):
