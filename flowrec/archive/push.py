@@ -9,11 +9,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flowrec.core import Progress, SessionError, UsageError, progress, say
+from flowrec.core import SessionError, UsageError, progress, say
 from flowrec.store import (
     SESSION_SUFFIX,
     TRAFFIC,
@@ -114,15 +113,23 @@ def push(sessions: Sequence[Path], target: str) -> Pushed:
             files[path] = _files(path)
         except SessionError as error:
             pushed.failed[path] = str(error)
-    _check_names([file for some in files.values() for file in some])
-    total = sum(file.stat().st_size for some in files.values() for file in some)
+    known: dict[str, Path] = {}
+    total = 0
+    for file in (file for some in files.values() for file in some):
+        if (other := known.setdefault(file.name, file)) is not file:
+            raise UsageError(f"{file}: has the name of {other}; push them to two folders")
+        total += file.stat().st_size
     before = 0
     with progress("pushing", max(total, 1), "bytes") as bar:
+
+        def advance(nbytes: int) -> None:
+            bar(before + nbytes)
+
         for path, some in files.items():
             try:
                 for file in some:
                     bar.stage(file.name)
-                    done = _push_one(bucket, path, file, partial(_advance, bar, before))
+                    done = _push_one(bucket, path, file, advance)
                     say(str(done))
                     pushed.files.append(done)
                     before += done.size_bytes
@@ -131,10 +138,6 @@ def push(sessions: Sequence[Path], target: str) -> Pushed:
             except SessionError as error:
                 pushed.failed[path] = str(error)
     return pushed
-
-
-def _advance(bar: Progress, before: int, nbytes: int) -> None:
-    bar(before + nbytes)
 
 
 def _folder(target: str) -> UrlPath:
@@ -155,20 +158,12 @@ def _files(session: Path) -> list[Path]:
     return [*files, *(beside for beside in (notes, *map(signature_file, files)) if beside.is_file())]
 
 
-def _check_names(files: Sequence[Path]) -> None:
-    known: dict[str, Path] = {}
-    for file in files:
-        other = known.setdefault(file.name, file)
-        if other is not file:
-            raise UsageError(f"{file}: has the name of {other}; push them to two folders")
-
-
 def _push_one(bucket: Bucket, session: Path, file: Path, done: Callable[[int], None]) -> PushedFile:
     if file == notes_file(session):
         return _pushed_notes(bucket, file)
     stored = bucket.stat(file.name)
     if stored is None and file.suffix != SESSION_SUFFIX:  # a signature
-        sent = bucket.upload(file.name, file, done)
+        sent = bucket.upload(file, done)
     elif stored is None:
         from flowrec.verbs import check  # late: it takes a second
 
@@ -176,7 +171,7 @@ def _push_one(bucket: Bucket, session: Path, file: Path, done: Callable[[int], N
         if verdict.exit_status == 1:
             worst = next(each.text for each in verdict.findings if each.level == "bad")
             raise SessionError(f"{file}: is not pushed, {worst}")
-        sent = bucket.upload(file.name, file, done)
+        sent = bucket.upload(file, done)
         if sent is not None:
             content, url = sent.content, bucket.url(file.name)
             compared = _read_back(url, file, content, sent.etag)
@@ -192,7 +187,8 @@ def _same(url: UrlPath, file: Path, stored: tuple[int, str] | None, done: Callab
         content = content_of_file(file, done)
         if etag == content.etag:
             return PushedFile(file, url, content.size, 0, content.sha256, "by its ETag")
-        if _is(url, content):
+        forget(url)
+        if session_sha256([url]) == content.sha256:
             return PushedFile(file, url, content.size, 0, content.sha256, _BY_ALL)
     raise SessionError(f"{url}: is there with another content than {file}, and stays; push to another folder")
 
@@ -231,12 +227,6 @@ def _ranges(size: int) -> list[tuple[int, int]]:
     """Ranges (offset, length) that are read back: begin, middle, end, and others so that 256 MB lie between two."""
     length, steps = min(_RANGE_BYTES, size), 2 + size // _RANGE_EVERY_BYTES
     return [(offset, length) for offset in sorted({number * (size - length) // steps for number in range(steps + 1)})]
-
-
-def _is(url: UrlPath, content: Content) -> bool:
-    """True if an object holds this, by reading it."""
-    forget(url)
-    return session_sha256([url]) == content.sha256
 
 
 def _pushed_notes(bucket: Bucket, file: Path) -> PushedFile:

@@ -108,21 +108,20 @@ def audit(
     ------
     SessionError : it is no session, or none that this flowrec can read; its text says what it is.
     """
+    why_not = ""
     try:
         contents = SessionContents(path)
-        found = Audit(path, contents.source.size)
     except (UnfinishedError, DamageError) as error:
+        why_not = _without_advice(error, path)
         with contextlib.closing(McapReader(path)) as source:
             contents = SessionContents(path, scan(source).summary)
-        found = Audit(path, contents.source.size, finished=False)
-        found.why_not = error.what if isinstance(error, DamageError) else _first_part(error, path)
     with contents:
-        found.flowrec_version, found.outcome = contents.flowrec_version, contents.outcome
-        found.region, found.topics = contents.region, contents.topics
+        found = Audit(path, contents.source.size, not why_not, why_not, contents.flowrec_version)
+        found.outcome, found.region, found.topics = contents.outcome, contents.region, contents.topics
         try:
             found.header = contents.header
         except SessionError as error:
-            found.header_fault = error.what if isinstance(error, DamageError) else _first_part(error, path)
+            found.header_fault = _without_advice(error, path)
         if begin is not None:
             begin(found)
         reading = _ChunkAudit(found, contents, see)
@@ -231,8 +230,8 @@ def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:
     )
 
 
-def _first_part(error: SessionError, path: Path) -> str:
-    return str(error).removeprefix(f"{path}: ").split("; ")[0]
+def _without_advice(error: SessionError, path: Path) -> str:
+    return error.what if isinstance(error, DamageError) else str(error).removeprefix(f"{path}: ").split("; ")[0]
 
 
 def edits_of(file: SessionMetadata, found: Scan) -> list[str] | None:

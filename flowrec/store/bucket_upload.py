@@ -170,13 +170,14 @@ class Bucket:
         made = self._ask(name, "put_object", len(data), Body=data, ContentMD5=md5, **condition)
         return None if made is None else _etag(made)
 
-    def upload(self, name: str, path: Path, progress: Callable[[int], None] = lambda _: None) -> Sent | None:
-        """Send a file; None if there is an object of that name already.
+    def upload(self, path: Path, progress: Callable[[int], None]) -> Sent | None:
+        """Send a file; None if there is an object of its name already.
 
         Parameters
         ----------
         progress : takes the bytes of the file that the bucket has.
         """
+        name = path.name
         with closing(LocalParts(path)) as parts:
             if parts.count > 1:
                 return _Upload(partial(self._ask, name), self._key(name), parts).run(progress)
@@ -218,7 +219,7 @@ class _Upload:
     def __init__(self, ask: Callable[..., Any], key: str, parts: LocalParts) -> None:
         self._ask, self._key, self._parts = ask, key, parts
         self._there: dict[int, str] = {}  # ETags by number
-        self._sending: dict[Future[None], int] = {}
+        self._sending: set[Future[int]] = set()
         self._stop = threading.Event()
         self._sent_bytes = self._done_bytes = 0
 
@@ -232,11 +233,9 @@ class _Upload:
                     self._done_bytes += len(data)
                     progress(self._done_bytes)
                     continue
-                while len(self._sending) >= _TOGETHER:
-                    self._wait(progress)
-                self._sending[threads.submit(self._send, upload_id, number, data, md5)] = len(data)
-            while self._sending:
-                self._wait(progress)
+                self._wait(_TOGETHER - 1, progress)
+                self._sending.add(threads.submit(self._send, upload_id, number, data, md5))
+            self._wait(0, progress)
         finally:
             self._stop.set()
             threads.shutdown(wait=False, cancel_futures=True)
@@ -258,47 +257,45 @@ class _Upload:
         named = [each for each in uploads if each["Key"] == self._key]
         newest = sorted(named, key=lambda each: str(each.get("Initiated")), reverse=True)
         for upload in newest[:_CANDIDATES]:
-            listed = dict(self._list_parts(upload))
-            fits = {number: etag for number, (size, etag) in listed.items() if self._is_part(number, size)}
+            upload_id: str = upload["UploadId"]
+            fits = {
+                number: _etag(part)
+                for part in self._list_parts(upload_id)
+                if (number := part["PartNumber"]) <= self._parts.count and part["Size"] == self._parts.length(number)
+            }
             if fits and fits[first := min(fits)] == _md5(self._parts.read(first)).hex():
                 self._there = fits
-                upload_id: str = upload["UploadId"]
                 return upload_id
         return None
 
-    def _list_parts(self, upload: Mapping[str, Any]) -> Iterator[tuple[int, tuple[int, str]]]:
+    def _list_parts(self, upload_id: str) -> Iterator[Mapping[str, Any]]:
         marker: dict[str, int] = {}
         while True:
-            found = self._ask("list_parts", UploadId=upload["UploadId"], **marker)
-            if found is None:  # it has ended meanwhile
-                return
-            for part in found.get("Parts", []):
-                yield part["PartNumber"], (part["Size"], _etag(part))
+            found = self._ask("list_parts", UploadId=upload_id, **marker) or {}  # none where it has ended meanwhile
+            yield from found.get("Parts", [])
             if not found.get("IsTruncated"):
                 return
             marker = {"PartNumberMarker": found["NextPartNumberMarker"]}
 
-    def _is_part(self, number: int, size: int) -> bool:
-        return number <= self._parts.count and size == self._parts.length(number)
-
-    def _send(self, upload_id: str, number: int, data: bytes, md5: bytes) -> None:
+    def _send(self, upload_id: str, number: int, data: bytes, md5: bytes) -> int:
         if self._stop.is_set():
-            return
+            return 0
         digest = base64.b64encode(md5).decode()
         words = {"UploadId": upload_id, "PartNumber": number, "Body": data, "ContentMD5": digest}
         sent = self._ask("upload_part", len(data), lambda: not self._stop.is_set(), **words)
         if sent is None:
             raise StoreError(f"{self._parts.path}: its upload was ended by somebody else; the same command goes on")
         self._there[number] = _etag(sent)
+        return len(data)
 
-    def _wait(self, progress: Callable[[int], None]) -> None:
-        """Until a part was sent; its error is raised here."""
-        for future in wait(self._sending, return_when=FIRST_COMPLETED).done:
-            length = self._sending.pop(future)
-            future.result()
-            self._sent_bytes += length
-            self._done_bytes += length
-            progress(self._done_bytes)
+    def _wait(self, left: int, progress: Callable[[int], None]) -> None:
+        """Until so many parts are left that are being sent; the error of a part is raised here."""
+        while len(self._sending) > left:
+            sent, self._sending = wait(self._sending, return_when=FIRST_COMPLETED)
+            for length in (future.result() for future in sent):
+                self._sent_bytes += length
+                self._done_bytes += length
+                progress(self._done_bytes)
 
 
 def _ours(error: Exception) -> Exception | None:

@@ -9,41 +9,23 @@ import threading
 import weakref
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from flowrec.core import SessionError, refuse_irregular
 from flowrec.store.session_path import UrlPath
+from flowrec.store.traffic import MissingError
+
+if TYPE_CHECKING:
+    from flowrec.store.remote_file import RemoteFile
 
 
-class ByteSource(Protocol):
-    """Bytes that can be read by range, from several threads at a time.
+class LocalFile:
+    """A file on this machine, whose bytes are read by range, from several threads at a time; see RemoteFile, too.
 
     Attributes
     ----------
     path : its name, for messages.
     size : number of bytes when it was opened.
-    """
-
-    path: Path
-    size: int
-
-    def read(self, offset: int, length: int) -> bytes:
-        """The bytes of a range that lies within `size`; fewer where the source has become shorter.
-
-        Raises
-        ------
-        SessionError : it can not be read, or has been closed.
-        """
-
-    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Ranges (offset, length) that will be read soon, each once; a hint, which may do nothing."""
-
-    def close(self) -> None:
-        """Release it; garbage collection releases it, too."""
-
-
-class LocalFile:
-    """A file on this machine.
 
     Raises
     ------
@@ -58,7 +40,7 @@ class LocalFile:
             refuse_irregular(path, SessionError)
             self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         except FileNotFoundError as error:
-            raise SessionError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
+            raise MissingError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
         except ValueError as error:  # a name with a NUL, which only another file can have given
             raise SessionError(f"{path}: is not the name of a file") from error
         except OSError as error:
@@ -68,6 +50,12 @@ class LocalFile:
         self.size = os.fstat(self._descriptor).st_size
 
     def read(self, offset: int, length: int) -> bytes:
+        """The bytes of a range that lies within `size`; fewer where the file has become shorter.
+
+        Raises
+        ------
+        SessionError : it can not be read, or has been closed.
+        """
         if not self._closer.alive:
             raise SessionError(f"{self.path}: has been closed; open the session again")
         data = b""
@@ -91,13 +79,14 @@ class LocalFile:
         return data
 
     def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        pass  # the operating system reads ahead
+        """Ranges (offset, length) that will be read soon, each once: the operating system reads ahead by itself."""
 
     def close(self) -> None:
+        """Release it; garbage collection releases it, too."""
         self._closer()
 
 
-def open_bytes(path: Path) -> ByteSource:
+def open_bytes(path: Path) -> LocalFile | RemoteFile:
     """The bytes that a path or URL names.
 
     Raises

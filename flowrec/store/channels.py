@@ -58,9 +58,6 @@ _OWN_TYPES = frozenset(topic.type for topic in TOPICS)
 _DECLARATION = "declaration"  # in the metadata of the channel of an extra topic
 _BITS = "bits"  # in the metadata of the frames' channel: depth of the images; 8 where it is not stated
 
-# A replay continues from what the stages recorded; without images it takes the tracks as they were recorded.
-_NEEDED = {topic.path for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {FRAME_PATH}
-
 
 @dataclass(frozen=True, slots=True)
 class Slot:
@@ -72,31 +69,25 @@ class Slot:
     metadata: dict[str, str]
 
 
-def message_codec(message_type: type[Any], schema_name: str = "", bits: int = 8) -> Codec:
+def message_codec(message_type: type[Any], schema_name: str = "", bits: int = 8, path: str = "") -> Codec:
     """The codec of any message type; of a Frame that of the schema, foxglove.RawImage where it is none of a Frame.
 
-    `bits` is the depth of the frames.
+    `bits` is the depth of the frames, `path` that of an extra topic, because packages may name types alike.
     """
     if message_type is Frame:
         return frame_codec(schema_name, bits)
-    return codec_of(message_type)
+    return codec_of(message_type, "" if message_type in _OWN_TYPES else path)
 
 
-def codec_of_extra(topic: Topic) -> Codec:
-    """The codec of a topic that is no field of `Tick`: of its path, because packages may name types alike."""
-    return codec_of(topic.type, "" if topic.type in _OWN_TYPES else topic.path)
-
-
-def _slots() -> Iterator[tuple[str, Slot]]:
+def _own_slots() -> Iterator[tuple[str, Slot]]:
     for number, topic in enumerate(TOPICS, 1):
-        group = FRAMES if topic.field == "frame" else STATE
+        group = FRAMES if topic.type is Frame else STATE
         yield topic.path, Slot(number, group, message_codec(topic.type).schema, {"role": topic.role.value})
     for number, view in enumerate(VIEWER_TOPICS, len(TOPICS) + 1):
-        metadata = {"role": "view", "made_from": view.source}
-        yield view.path, Slot(number, VIEW, view.schema, metadata)
+        yield view.path, Slot(number, VIEW, view.schema, {"role": "view", "made_from": view.source})
 
 
-SLOTS: dict[str, Slot] = dict(_slots())
+SLOTS: dict[str, Slot] = dict(_own_slots())
 VIEWED = frozenset(view.path for view in VIEWER_TOPICS)
 
 
@@ -107,14 +98,12 @@ def slots_of(topics: TopicTable) -> dict[str, Slot]:
     ------
     UsageError : an extra topic has the path of a viewer topic.
     """
-    if not topics.extra:
-        return SLOTS
     slots = dict(SLOTS)
     for number, topic in enumerate(topics.extra, len(SLOTS) + 1):
         if topic.path in SLOTS:
             raise UsageError(f"{topic.path}: is a topic of flowrec; choose another path")
         metadata = {"role": topic.role.value, _DECLARATION: declaration(topic)}
-        slots[topic.path] = Slot(number, STATE, codec_of_extra(topic).schema, metadata)
+        slots[topic.path] = Slot(number, STATE, message_codec(topic.type, path=topic.path).schema, metadata)
     return slots
 
 
@@ -149,7 +138,8 @@ def left_out(patterns: Iterable[str], topics: TopicTable = FIXED) -> frozenset[s
     UsageError : a pattern matches no topic, or one without which the session could not be replayed.
     """
     chosen: set[str] = set()
-    needed_ones = _NEEDED | {topic.path for topic in topics.extra if topic.role in (Role.INPUT, Role.OUTPUT)}
+    # A replay continues from what the stages recorded; without images it takes the tracks as they were recorded.
+    needed_ones = {topic.path for topic in topics.topics if topic.role in (Role.INPUT, Role.OUTPUT)} - {FRAME_PATH}
     for pattern in patterns:
         found = {path for path in slots_of(topics) if is_left_out(path, [pattern])}
         found |= {path for path in VIEWED if is_left_out(f"/view{path}", [pattern])}
@@ -220,7 +210,6 @@ class SessionContents(SessionMetadata):
         SessionError : it is damaged.
         """
         kind = self.topics.by_field[self.fields[record.channel]].type
-        assert isinstance(record.payload, memoryview)
         codec, start_unix_ns = self.codecs[record.channel], self.source.start_unix_ns
         message = decode(kind, codec, record.payload, record.sequence, start_unix_ns)
         if fault := shape_error(message):
@@ -248,7 +237,7 @@ class SessionContents(SessionMetadata):
 
         def small(record: Record) -> Row:
             payload = record.payload
-            if len(payload) > _SMALL_BYTES:  # type: ignore[arg-type]  # a memoryview here
+            if len(payload) > _SMALL_BYTES:
                 return whole(record)
             try:
                 parsed = parse(payload)
@@ -265,9 +254,8 @@ class SessionContents(SessionMetadata):
         channel = self.channels[channel_number]
         found = self.schemas[channel.schema_id]
         topic = self.topics.by_path[channel.topic]
-        kind, extra = topic.type, topic in self.topics.extra
-        codec = codec_of_extra(topic) if extra else message_codec(kind, found.name, self.frame_bits)
-        self.codecs[channel_number] = codec
+        kind = topic.type
+        codec = self.codecs[channel_number] = message_codec(kind, found.name, self.frame_bits, topic.path)
         expected = codec.schema
         ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
         self.recorded_fields[self.fields[channel_number]] = ours_all

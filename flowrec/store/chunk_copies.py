@@ -8,7 +8,7 @@ together anew.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +16,8 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
 from numpy.typing import NDArray
 
-from flowrec.core import BY_PATH, Applied, Outcome, SessionError, Timing, message_fields, seconds
-from flowrec.store.channels import SLOTS, VIEWED, Row, SessionContents
+from flowrec.core import BY_PATH, Applied, Message, Outcome, SessionError, Timing, seconds
+from flowrec.store.channels import SLOTS, VIEWED, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_format import (
@@ -37,10 +37,6 @@ from flowrec.store.write_queue import Counters
 _MESSAGE_BYTES = RECORD_HEAD.size + MESSAGE_HEAD.size  # of a record besides its payload
 _ANEW = (OUTCOME, DIGEST, "flowrec.view")  # records of which the new file gets its own; the last is of older files
 _COUNTED = ("ticks", "dropped_frames", "frames_dropped")  # the last one in older files
-_STAMP, _ABSENT = (
-    [each.name for each in message_fields(Applied)].index(name) for name in ("stamp_ns", "absent_until_ns")
-)
-_DROPPED = [each.name for each in message_fields(Timing)].index("dropped_frames")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +78,8 @@ class RecoveryTally:
         self._first_ns: int | None = None
         self._skipped, self._first_skipped = 0, ""
 
-    def add(self, field: str, tick_ns: int, row: Row) -> None:
-        """Enter a message that is kept, by its field of Tick and the row of its values."""
+    def add(self, field: str, tick_ns: int, message: Message) -> None:
+        """Enter a message that is kept, by its field of Tick."""
         if self._first_ns is None or tick_ns < self._first_ns:
             self._first_ns = tick_ns
         if field in self._times_ns:
@@ -93,10 +89,10 @@ class RecoveryTally:
         if tick_ns > self._tick_ns:
             self._ticks += tick_ns != self._keyframe_ns
             self._tick_ns = tick_ns
-        if field == "applied" and row[_ABSENT] == row[_STAMP]:
+        if isinstance(message, Applied) and message.absent_until_ns == message.stamp_ns:
             self._without_image_ns.append(tick_ns)
-        elif field == "timing":
-            self._dropped_frames = row[_DROPPED]
+        elif isinstance(message, Timing):
+            self._dropped_frames = message.dropped_frames
 
     def skip(self, fault: str) -> None:
         """Enter a message that can not be decoded."""
@@ -184,10 +180,12 @@ class ChunkCopier:
     def __init__(self, contents: SessionContents, out: McapWriter, tally: RecoveryTally) -> None:
         self._contents, self._source = contents, contents.source
         self._out, self._tally = out, tally
-        self._checks = {channel: self._check_of(channel) for channel in contents.fields}
-        self.draws = all(_declares(contents, slot.channel, path) for path, slot in SLOTS.items() if path in VIEWED)
+        declared = {(number, channel.topic) for number, channel in contents.channels.items()}
+        self.draws = {(slot.channel, path) for path, slot in SLOTS.items() if path in VIEWED} <= declared
         out.start(self._source.header.profile, self._source.header.library)
-        self._add_records()
+        for record in contents.metadata:
+            if record.name not in _ANEW:
+                out.add(Metadata(record.name, self._source.metadata(record)))
         for place in contents.attachments:
             out.add(self._source.record(place.offset, place.length, Opcode.ATTACHMENT))
         for schema in contents.schemas.values():
@@ -202,11 +200,6 @@ class ChunkCopier:
             chunk = self._stored_chunk(place, records) if all(kept) else None
             self._out.add_chunks([chunk or self._rebuilt(place, kept)])
 
-    def _add_records(self) -> None:
-        for place in self._contents.metadata:
-            if place.name not in _ANEW:
-                self._out.add(Metadata(place.name, self._source.metadata(place)))
-
     def _is_sound(self, record: Record) -> bool:
         """True if a message can be kept; what is in it is tallied."""
         if record.channel not in self._contents.channels:
@@ -214,32 +207,23 @@ class ChunkCopier:
             return False
         if self.draws and self._contents.channels[record.channel].topic in VIEWED:
             return False
-        check = self._checks.get(record.channel)
-        if check is None:  # of another program
+        field = self._contents.fields.get(record.channel)
+        if field is None:  # of another program
             return True
         try:
-            check(record)
+            message = self._contents.decode(record)
         except SessionError as error:
             path = self._contents.channels[record.channel].topic
             self._tally.skip(f"{path} at {record.log_ns} ns: {error}")
             return False
+        self._tally.add(field, record.log_ns, message)
         return True
-
-    def _check_of(self, channel: int) -> Callable[[Record], None]:
-        """Decodes a message of a known topic and tallies it; raises SessionError for one that makes no sense."""
-        field = self._contents.fields[channel]
-        if field == "frame":
-            decode = self._contents.decode
-            return lambda record: self._tally.add(field, record.log_ns, (decode(record).stamp_ns,))
-        row_of = self._contents.row_decoder(channel)
-        return lambda record: self._tally.add(field, record.log_ns, row_of(record))
 
     def _stored_chunk(self, place: ChunkIndex, records: list[Record]) -> SealedChunk | None:
         """The chunk as it is in the file; None where it lacks a checksum, or holds something besides messages."""
         indexes = MessageIndexes()
         at, start_unix_ns = 0, self._source.start_unix_ns
         for log_ns, channel, sequence, payload in records:
-            assert isinstance(payload, memoryview)
             indexes.add(channel, sequence, log_ns + start_unix_ns, at, payload)
             at += _MESSAGE_BYTES + len(payload)
         body = self._source.body(place.chunk_start_offset, place.chunk_length, Opcode.CHUNK)
@@ -271,8 +255,3 @@ class ChunkCopier:
                 builder.add(channel, sequence, log_unix_ns, publish_unix_ns, payload)
                 times.append(log_unix_ns)
         return replace(builder.seal(), message_start_time=min(times), message_end_time=max(times))
-
-
-def _declares(contents: SessionContents, channel: int, path: str) -> bool:
-    found = contents.channels.get(channel)
-    return found is not None and found.topic == path

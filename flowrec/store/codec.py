@@ -13,7 +13,7 @@ import functools
 import json
 import math
 import operator
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from flowrec.core import (
     Level,
     MessageField,
     OperatorEvent,
+    RigError,
     SessionError,
     as_read,
     message_fields,
@@ -49,8 +50,6 @@ _UNCOPIED_BYTES = 1 << 14  # a larger array bypasses protobuf when it is written
 _LARGE_BYTES = 1 << 16  # in a larger message arrays bypass protobuf when it is read
 _FIELDS_LIMIT = 64  # protobuf parses a message with more fields
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
-# For lengths between these numpy converts quicker than a loop, but makes a list first.
-_SHORT_VECTOR, _LONG_VECTOR = 64, 1 << 16
 
 # Levels of foxglove.Log by Event.level; a level that is not listed is kept in the name.
 _LEVELS: dict[str, int] = {"debug": 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4, "fatal": 5}
@@ -68,14 +67,12 @@ class Codec:
     schema : protobuf schema of the payload.
     encode : message -> parts of the payload, in order; large arrays are not copied.
     decode : payload, MCAP sequence -> message.
-    sequence : message -> the MCAP sequence that it must have; None: the writer counts.
     has_unix_time : the schema is one of foxglove's, whose `timestamp` is Unix time; flowrec's own have stamps.
     """
 
     schema: Schema
     encode: Callable[[Any], Payload]
     decode: Callable[[bytes | memoryview, int], Any]
-    sequence: Callable[[Any], int] | None = None
     has_unix_time: bool = False
 
 
@@ -112,7 +109,7 @@ def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> Encoded
     if start_unix_ns and codec.has_unix_time:
         message = replace(message, stamp_ns=stamp_ns + start_unix_ns)
     try:
-        sequence = codec.sequence(message) if codec.sequence is not None else None
+        sequence = message.index if isinstance(message, Frame) else None
         try:
             return Encoded(stamp_ns, sequence, codec.encode(message))
         except UnicodeEncodeError:
@@ -142,7 +139,7 @@ def decode(
             message = codec.decode(payload, sequence)
             if start_unix_ns and codec.has_unix_time:
                 message = replace(message, stamp_ns=message.stamp_ns - start_unix_ns)
-    except (DecodeError, ValueError, TypeError, OverflowError) as error:
+    except (DecodeError, ValueError, TypeError, OverflowError, RigError) as error:  # the last: a level of an image
         raise SessionError(f"damaged {message_type.__name__}: {error}") from error
     return message
 
@@ -165,7 +162,9 @@ def byte_field_head(number: int, nbytes: int) -> bytes:
 
 
 def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes | memoryview, dict[int, memoryview]]:
-    """The message without some of its byte fields, and those fields by number, as views of the payload.
+    """The message without some of its byte fields, and those fields by number.
+
+    They are views of the payload, or copies where a view would keep a much larger buffer in memory.
 
     Raises
     ------
@@ -182,22 +181,19 @@ def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes
             found[number] = payload[value:end]
         else:
             rest.append(payload[begin:end])
+    buffer = payload.obj
+    if not isinstance(buffer, bytes | bytearray) or len(buffer) > 2 * sum(map(len, found.values())):
+        found = {number: memoryview(bytes(view)) for number, view in found.items()}
     return b"".join(rest), found
 
 
-def detach_fields(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int, memoryview]:
-    """The cut-out fields, copied where a view would keep a much larger buffer in memory."""
-    buffer = payload.obj
-    copy = not isinstance(buffer, bytes | bytearray) or len(buffer) > 2 * sum(map(len, fields.values()))
-    return {number: memoryview(bytes(view)) if copy else view for number, view in fields.items()}
-
-
 def _without_surrogates(message: Any) -> Any:
-    changes = {}
-    for form in message_fields(type(message)):
-        value = getattr(message, form.name)
-        changes[form.name] = value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
-    return type(message)(**changes)
+    changes = {
+        form.name: value.encode("utf-8", "backslashreplace").decode()
+        for form in message_fields(type(message))
+        if isinstance(value := getattr(message, form.name), str)
+    }
+    return replace(message, **changes)
 
 
 def _encoder(message_type: type[Any], schema: Schema) -> Callable[[Any], Payload]:
@@ -244,7 +240,7 @@ def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memor
             parsed = parse(payload)
             return message_type(*[unpack(parsed) for unpack in unpack_all])
         rest, found = cut_byte_fields(memoryview(payload), arrays)
-        parsed, found = parse(rest), detach_fields(memoryview(payload), found)
+        parsed = parse(rest)
         return message_type(
             *[
                 _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)
@@ -280,10 +276,7 @@ def _unpacker(form: MessageField, vector_of: Callable[[Any], Any]) -> Callable[[
 
 
 def _vector(values: Any) -> NDArray[np.float64]:
-    count = len(values)
-    if _SHORT_VECTOR <= count <= _LONG_VECTOR:
-        return np.array(values, np.float64)
-    return np.fromiter(values, np.float64, count)
+    return np.fromiter(values, np.float64, len(values))
 
 
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
@@ -310,7 +303,7 @@ def _event_codec() -> Codec:
     def encode(event: Event) -> Payload:
         level = _LEVELS.get(event.level, 0)
         name = _EVENT_NAME if level else f"{_EVENT_NAME}.{event.level}"
-        return _log(schema, event.stamp_ns, level, event.text, name)
+        return _log(event.stamp_ns, level, event.text, name)
 
     def decode(payload: bytes | memoryview, _sequence: int) -> Event:
         parsed = schema.wire.FromString(payload)
@@ -333,7 +326,7 @@ def _operator_codec() -> Codec:
         text, name = f"{event.action}: {event.text}", _OPERATOR_NAME + event.action
         numbers: dict[str, Any] = {"goal_um": event.goal_um.tolist(), "speed_limit_um_s": event.speed_limit_um_s}
         stated = {key: value for key, value in numbers.items() if value not in ([], None)}
-        return _log(schema, event.stamp_ns, _LEVELS[Level.INFO], text, name, json.dumps(stated) if stated else "")
+        return _log(event.stamp_ns, _LEVELS[Level.INFO], text, name, json.dumps(stated) if stated else "")
 
     def decode(payload: bytes | memoryview, _sequence: int) -> OperatorEvent:
         parsed = schema.wire.FromString(payload)
@@ -359,8 +352,8 @@ def _operator_numbers(text: str) -> dict[str, Any]:
     return numbers
 
 
-def _log(schema: Schema, stamp_ns: int, level: int, text: str, name: str, file: str = "") -> Payload:
-    log = schema.wire(timestamp=timestamp(stamp_ns), level=level, message=text, name=name, file=file)
+def _log(stamp_ns: int, level: int, text: str, name: str, file: str = "") -> Payload:
+    log = foxglove_schema("Log").wire(timestamp=timestamp(stamp_ns), level=level, message=text, name=name, file=file)
     return (log.SerializeToString(),)
 
 

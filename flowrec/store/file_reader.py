@@ -6,7 +6,7 @@ import contextlib
 import heapq
 import itertools
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from operator import attrgetter
 from pathlib import Path
@@ -34,7 +34,7 @@ _FEW = 64  # messages of a chunk that may wait as objects
 
 _Decode = Callable[[Record], Record]
 _ChunkContent = bytes | memoryview | list[Record]
-_by_time = attrgetter("log_ns")
+_by_time, _place = attrgetter("log_ns"), attrgetter("chunk_start_offset")
 
 
 class FileReader(SessionContents):
@@ -55,24 +55,31 @@ class FileReader(SessionContents):
 
     def new_messages(self, start_ns: int | None, fields: Collection[str]) -> Iterator[tuple[int, NewMessages]]:
         """Stamp and new messages of some topics of all ticks, or of those at and after `start_ns`."""
-        size = _StateSize(self.source.path)
-        for stamp_ns, records in itertools.groupby(self._records_from(start_ns, fields), key=_by_time):
+        sizes: dict[str, int] = {}
+        read = dict.fromkeys(self._channels_of(fields), 0)
+        for stamp_ns, records in itertools.groupby(self._read(fields, start_ns or 0), key=_by_time):
             new: NewMessages = {}
             for record in records:
                 field = self.fields[record.channel]
-                size.add(field, record)
+                self._limit_state(sizes, field, record)
                 new[field] = self._message(record)
+                read[record.channel] += 1
             yield stamp_ns, new
+        for channel, count in read.items() if start_ns is None else ():
+            announced = self.statistics.channel_message_counts.get(channel, 0)
+            if count != announced:
+                path = self.channels[channel].topic
+                raise DamageError(self.source.path, f"{announced} messages of {path} are announced, {count} were read")
 
     def messages(self, field: str) -> Iterator[tuple[int, Any]]:
         """All messages of one topic, each with the stamp of its tick."""
-        for record in self._records_of(self._channels_of({field}), self._decoded_frame):
+        for record in self._read({field}):
             yield record.log_ns, self._message(record)
 
     def rows(self, fields: Collection[str]) -> Iterator[tuple[int, str, Row]]:
-        """Stamp of the tick, field of Tick and row of plain values of each message of some topics."""
+        """Stamp of the tick, field of Tick and row of plain values of each message of some topics but the images."""
         decoders = {channel: self.row_decoder(channel) for channel in self._channels_of(fields)}
-        for record in self._records_of(set(decoders)):
+        for record in self._read(fields):
             try:
                 row = decoders[record.channel](record)
             except SessionError as error:
@@ -102,6 +109,17 @@ class FileReader(SessionContents):
         state = {field: self._restore(record) for field, record in latest.items()}
         return max((record.log_ns for record in latest.values()), default=-1), state
 
+    def _limit_state(self, sizes: dict[str, int], field: str, record: Record) -> None:
+        """Note the size of the latest message of a topic; DamageError if the state at a tick has become too large.
+
+        The limit bounds the memory that a hostile file can take.
+        """
+        payload = record.payload
+        sizes[field] = payload.image.nbytes if isinstance(payload, Frame) else len(payload)
+        if (total := sum(sizes.values())) > _STATE_LIMIT_BYTES:
+            what = f"the state at {record.log_ns} ns takes {total} bytes, more than {_STATE_LIMIT_BYTES}"
+            raise DamageError(self.source.path, what)
+
     def _message(self, record: Record) -> Any:
         if isinstance(record.payload, Message):
             return record.payload
@@ -124,13 +142,6 @@ class FileReader(SessionContents):
             return record
         return record._replace(payload=frame) if frame.image.nbytes <= _GROWTH * len(record.payload) else record
 
-    def _records_of(self, channels: set[int], decode: _Decode | None = None) -> Iterator[Record]:
-        """The messages of some channels in order of time."""
-        with _threads() as executor:
-            for record in _merge(self.source, self._chunks_with(channels), executor, decode):
-                if record.channel in channels:
-                    yield record
-
     def _restore(self, record: Record) -> Any:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
         key = (self.source.path, record.channel, record.log_ns)
@@ -139,37 +150,25 @@ class FileReader(SessionContents):
             del self._cache[next(iter(self._cache))]
         return message
 
-    def _records_from(self, start_ns: int | None, fields: Collection[str]) -> Iterator[Record]:
+    def _read(self, fields: Collection[str], start_ns: int = 0) -> Iterator[Record]:
         """The messages of some topics from a time on, state and frames merged."""
-        start = 0 if start_ns is None else start_ns
-        state, frames = self._chunks_from(start)
         wanted = self._channels_of(fields)
-        read = dict.fromkeys(wanted, 0)
+        state, frames = self._chunks_from(start_ns, wanted)
         with _threads() as executor:
-            streams = [_merge(self.source, state, executor)]
-            if wanted & self._frame_channels:
-                streams.append(_merge(self.source, frames, executor, self._decoded_frame))
-            for record in heapq.merge(*streams, key=_by_time):
-                if record.log_ns >= start and record.channel in wanted:
-                    read[record.channel] += 1
+            merged = (
+                _merge(self.source, state, executor),
+                _merge(self.source, frames, executor, self._decoded_frame),
+            )
+            for record in heapq.merge(*merged, key=_by_time):
+                if record.log_ns >= start_ns and record.channel in wanted:
                     yield record
-        if start_ns is None:
-            self._check_counts(read)
 
-    def _check_counts(self, read: Mapping[int, int]) -> None:
-        """Raise DamageError for a file with other numbers of messages than its index says."""
-        for channel, count in read.items():
-            announced = self.statistics.channel_message_counts.get(channel, 0)
-            if count != announced:
-                path = self.channels[channel].topic
-                raise DamageError(self.source.path, f"{announced} messages of {path} are announced, {count} were read")
-
-    def _chunks_from(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
-        """Chunks that end at or after a time: those with anything but frames, and those with frames only."""
+    def _chunks_from(self, start_ns: int, channels: set[int]) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
+        """Chunks of channels that end at or after a time: with anything but frames, and with frames only."""
         state: list[ChunkIndex] = []
         frames: list[ChunkIndex] = []
         largest_bytes = PIXELS_LIMIT * pixel_type(self.frame_bits).itemsize + _LARGE_CHUNK_BYTES
-        for chunk in self._chunks_with(set(self.fields)):
+        for chunk in self._chunks_with(channels):
             if chunk.message_end_time >= start_ns:
                 only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
                 if only_frames and chunk.uncompressed_size > largest_bytes:
@@ -190,7 +189,7 @@ class FileReader(SessionContents):
 
     def _latest(self, stamp_ns: int, channels: set[int]) -> dict[str, Record]:
         latest: dict[str, Record] = {}
-        size = _StateSize(self.source.path)
+        sizes: dict[str, int] = {}
         chunks = [chunk for chunk in self._chunks_with(channels) if chunk.message_start_time <= stamp_ns]
         chunks.sort(key=lambda chunk: chunk.message_end_time, reverse=True)
         self.source.prefetch(_likely(chunks, channels, stamp_ns))
@@ -205,10 +204,11 @@ class FileReader(SessionContents):
                 if field_name not in fields or field_name is None or record.log_ns > stamp_ns:
                     continue
                 if field_name not in latest or latest[field_name].log_ns <= record.log_ns:
-                    size.add(field_name, record)
+                    self._limit_state(sizes, field_name, record)
                     latest[field_name] = record
             if chunk.uncompressed_size > _LARGE_CHUNK_BYTES:  # it is not kept in memory for a few messages in it
-                latest = {field: _detach(record) for field, record in latest.items()}
+                for name, record in latest.items():
+                    latest[name] = record._replace(payload=memoryview(bytes(record.payload)))
         return latest
 
 
@@ -225,31 +225,6 @@ def _likely(chunks: list[ChunkIndex], channels: set[int], stamp_ns: int) -> list
         if not missing:
             break
     return likely
-
-
-class _StateSize:
-    """The bytes of the full state at a tick. Their bound limits the memory that a hostile file can take."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._nbytes: dict[str, int] = {}
-        self._total = 0
-
-    def add(self, field: str, record: Record) -> None:
-        """Count the latest message of a topic; DamageError when the state has become too large."""
-        payload = record.payload
-        nbytes = payload.image.nbytes if isinstance(payload, Frame) else len(payload)  # type: ignore[arg-type]
-        self._total += nbytes - self._nbytes.get(field, 0)
-        self._nbytes[field] = nbytes
-        if self._total > _STATE_LIMIT_BYTES:
-            what = f"the state at {record.log_ns} ns takes {self._total} bytes, more than {_STATE_LIMIT_BYTES}"
-            raise DamageError(self._path, what)
-
-
-def _detach(record: Record) -> Record:
-    """The record with a copy of its payload instead of a view of its chunk."""
-    payload = record.payload
-    return record._replace(payload=memoryview(bytes(payload))) if isinstance(payload, memoryview) else record
 
 
 @contextlib.contextmanager
@@ -283,9 +258,7 @@ def _merge(
     ------
     SessionError : a chunk is damaged, or more chunks overlap than fit into memory.
     """
-    waiting = deque(
-        _overlapping(source, sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset)))
-    )
+    waiting = deque(_overlapping(source, sorted(chunks, key=attrgetter("message_start_time", "chunk_start_offset"))))
     running: deque[tuple[list[ChunkIndex], Future[list[_ChunkContent]]]] = deque()
     ahead_bytes, ahead = 0, _AHEAD_AT_FIRST
     while waiting or running:
@@ -309,12 +282,12 @@ def _merge(
 
 
 def _overlapping(source: McapReader, chunks: list[ChunkIndex]) -> Iterator[list[ChunkIndex]]:
-    """Bundles of chunks whose times overlap."""
+    """Bundles of chunks whose times overlap, each in file order."""
     bundle: list[ChunkIndex] = []
     nbytes = end_ns = 0
     for chunk in chunks:
         if bundle and chunk.message_start_time > end_ns:
-            yield bundle
+            yield sorted(bundle, key=_place)
             bundle, nbytes = [], 0
         end_ns = max(end_ns, chunk.message_end_time) if bundle else chunk.message_end_time
         bundle.append(chunk)
@@ -322,7 +295,7 @@ def _overlapping(source: McapReader, chunks: list[ChunkIndex]) -> Iterator[list[
         if nbytes > CHUNK_LIMIT_BYTES and len(bundle) > 1:
             raise source.damage_error(chunk.chunk_start_offset, "too many chunks claim the same time")
     if bundle:
-        yield bundle
+        yield sorted(bundle, key=_place)
 
 
 def _size(bundle: list[ChunkIndex]) -> int:
@@ -345,9 +318,8 @@ def _contents(source: McapReader, bundle: list[ChunkIndex], decode: _Decode | No
 
 
 def _sorted_messages(source: McapReader, bundle: list[ChunkIndex], contents: list[_ChunkContent]) -> Iterator[Record]:
-    places = [chunk.chunk_start_offset for chunk in bundle]
     records: list[Record] = []
-    for place, content in sorted(zip(places, contents, strict=True), key=lambda pair: pair[0]):
+    for place, content in zip(map(_place, bundle), contents, strict=True):
         records += content if isinstance(content, list) else source.messages_in(content, place)
         if len(records) > MESSAGES_LIMIT:
             raise source.damage_error(place, "too many messages claim the same time")
@@ -356,5 +328,5 @@ def _sorted_messages(source: McapReader, bundle: list[ChunkIndex], contents: lis
     first_ns = min(chunk.message_start_time for chunk in bundle)
     last_ns = max(chunk.message_end_time for chunk in bundle)
     if records and not first_ns <= records[0].log_ns <= records[-1].log_ns <= last_ns:
-        raise source.damage_error(places[0], "there are messages of other times than the index tells")
+        raise source.damage_error(_place(bundle[0]), "there are messages of other times than the index tells")
     return iter(records)

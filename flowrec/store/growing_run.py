@@ -84,16 +84,12 @@ class GrowingRun:
     @cached_property
     def config(self) -> ResolvedConfig:
         """The configuration of the run."""
-        from flowrec.stages import config_from_toml
-
-        return config_from_toml(self.header.config_toml, f"{self.path}: config.toml inside", self.header.provenance)
+        return self.header.config(f"{self.path}: config.toml inside")
 
     @cached_property
     def chip(self) -> Chip:
         """The chip."""
-        from flowrec.physics import chip_from_files
-
-        return chip_from_files(self.header.chip_png, self.header.chip_toml)
+        return self.header.chip()
 
     def ticks(self) -> Iterator[Tick]:
         """The ticks as they come, from the beginning of the present file to the end of the run.
@@ -107,13 +103,13 @@ class GrowingRun:
             yield from self._news()
             if self._file.ended:
                 following = part_path(self.path, part_number(self._file.path) + 1)
-                if not part_number(self._file.path) or not self._begins(following):
+                # The next part is there, or will be: a part is completed beside it.
+                if not part_number(self._file.path) or not (following.exists() or partial_path(following).exists()):
                     return
                 self._file = _GrowingFile(following)
-            elif self._file.is_left():
+            elif (partial := partial_path(self._file.path)).exists() and not is_growing(partial):
                 raise SessionError(
-                    f"{partial_path(self._file.path)}: its recorder has ended without completing it;"
-                    f" `flowrec recover {partial_path(self._file.path)}` does"
+                    f"{partial}: its recorder has ended without completing it; `flowrec recover {partial}` does"
                 )
             else:
                 time.sleep(_POLL_S)
@@ -127,11 +123,6 @@ class GrowingRun:
                     break
                 self._tick = reader.topics.with_messages(self._tick, stamp_ns, new)
                 yield self._tick
-
-    @staticmethod
-    def _begins(part: Path) -> bool:
-        """True if there is this part, or there will be: a part is completed beside the next one."""
-        return part.exists() or partial_path(part).exists()
 
 
 class _GrowingFile:
@@ -187,11 +178,6 @@ class _GrowingFile:
         last_ns = max(last.values(), default=-1)
         image_ns = last.get("frame", last_ns)
         return last_ns if self.ended or last_ns - image_ns > _IMAGE_LATE_NS else image_ns
-
-    def is_left(self) -> bool:
-        """True if nobody completes it."""
-        partial = partial_path(self.path)
-        return partial.exists() and not is_growing(partial)
 
     def _present(self) -> Path:
         partial = partial_path(self.path)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -24,9 +24,6 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-
-if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
-    from flowrec.core import Message
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -54,7 +51,7 @@ class Record(NamedTuple):
     log_ns: int
     channel: int
     sequence: int
-    payload: memoryview | Message  # a message where it has been decoded already
+    payload: Any  # a memoryview, or a message where it has been decoded already
 
 
 class ChannelIndex(NamedTuple):
@@ -146,8 +143,8 @@ class Summary:
             chunk.message_end_time -= start_unix_ns
 
 
-def parse_summary(data: bytes, data_start: int, data_end: int) -> Summary:
-    """The summary from its bytes; what it lists lies between `data_start` and `data_end` of the file.
+def parse_summary(data: bytes, data_end: int) -> Summary:
+    """The summary from its bytes; what it lists lies before `data_end` in the file.
 
     Raises
     ------
@@ -177,7 +174,7 @@ def parse_summary(data: bytes, data_start: int, data_end: int) -> Summary:
             summary.metadata.append(MetadataIndex.read(stream))
         elif opcode == Opcode.STATISTICS:
             summary.statistics = Statistics.read(stream)
-    _check_places(summary, data_start, data_end)
+    _check_places(summary, data_end)
     _check_counts(summary)
     return summary
 
@@ -228,17 +225,13 @@ def _chunk_index(data: bytes, at: int, end: int, interned: dict[tuple[bytes, byt
     )  # fmt: skip
 
 
-def _places(summary: Summary) -> Iterable[tuple[int, int]]:
-    """Offset and length of everything that is listed."""
-    yield from ((chunk.chunk_start_offset, chunk.chunk_length) for chunk in summary.chunks)
-    yield from ((index.offset, index.length) for index in summary.attachments)
-    yield from ((index.offset, index.length) for index in summary.metadata)
-
-
-def _check_places(summary: Summary, start: int, end: int) -> None:
+def _check_places(summary: Summary, end: int) -> None:
     """Raise ValueError if two listed records overlap: with overlaps a small file could list endless data."""
-    reached = start
-    for offset, length in sorted(_places(summary)):
+    indexes: list[AttachmentIndex | MetadataIndex] = [*summary.attachments, *summary.metadata]
+    places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in summary.chunks]
+    places += [(index.offset, index.length) for index in indexes]
+    reached = len(MAGIC)
+    for offset, length in sorted(places):
         if offset < reached:
             raise ValueError(f"what is listed at byte {offset} lies over something else")
         reached = offset + length

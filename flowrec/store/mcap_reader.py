@@ -173,7 +173,7 @@ class McapReader:
         if footer.summary_crc and zlib.crc32(tail[: FOOTER_BYTES - 4], zlib.crc32(data)) != footer.summary_crc:
             raise self.damage_error(start, "the checksum of the index is wrong")
         with self.parsing(start):
-            return parse_summary(data, len(MAGIC), start)
+            return parse_summary(data, start)
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""
@@ -219,10 +219,16 @@ class McapReader:
             (nbytes,) = LONG.unpack_from(body, at)
             if nbytes != length - RECORD_HEAD.size - at - LONG.size:
                 raise ValueError("the chunk is not as long as announced")
-            _refuse_bomb(size, nbytes)
-            if compression == "zstd":
-                _refuse_other_size(data, size)
-            if not whole and _can_be_streamed(data, compression):
+            if size > CHUNK_LIMIT_BYTES:
+                raise ValueError(f"a chunk of {size} bytes, more than {CHUNK_LIMIT_BYTES}")
+            if size > _FREE_BYTES and size > _RATIO_LIMIT * nbytes:
+                raise ValueError(f"a chunk that unpacks {nbytes} bytes to {size}")
+            packed = compression == "zstd"
+            # The library allocates the size in zstd's own header, also beyond the limit that it is given.
+            if packed and zstandard.frame_content_size(data) not in (-1, size):
+                raise ValueError("zstd announces another size than the chunk")
+            # Streamed decompression needs little memory besides its output, if the window is not large.
+            if packed and not whole and zstandard.get_frame_parameters(data).window_size <= _WINDOW_LIMIT_BYTES:
                 content: bytes | memoryview = self._decompress_stream(offset + length - nbytes, offset + length, size)
             else:
                 data = data if whole else self.body(offset, length, Opcode.CHUNK)[at + LONG.size :]
@@ -332,24 +338,6 @@ def _text(body: memoryview, at: int, nbytes: int) -> tuple[str, int]:
     if nbytes > len(body) - at:
         raise ValueError(f"a text of {nbytes} bytes where {len(body) - at} are left")
     return str(body[at : at + nbytes], "utf-8"), at + nbytes
-
-
-def _refuse_bomb(size: int, nbytes: int) -> None:
-    if size > CHUNK_LIMIT_BYTES:
-        raise ValueError(f"a chunk of {size} bytes, more than {CHUNK_LIMIT_BYTES}")
-    if size > _FREE_BYTES and size > _RATIO_LIMIT * nbytes:
-        raise ValueError(f"a chunk that unpacks {nbytes} bytes to {size}")
-
-
-def _refuse_other_size(data: memoryview, size: int) -> None:
-    # The library allocates the size in zstd's own header, also beyond the limit that it is given.
-    if zstandard.frame_content_size(data) not in (-1, size):
-        raise ValueError("zstd announces another size than the chunk")
-
-
-def _can_be_streamed(begin: memoryview, compression: str) -> bool:
-    """True if streamed decompression needs little memory besides its output."""
-    return compression == "zstd" and zstandard.get_frame_parameters(begin).window_size <= _WINDOW_LIMIT_BYTES
 
 
 def _decompress(data: memoryview, compression: str, size: int) -> bytes | memoryview:

@@ -144,7 +144,7 @@ class McapWriter:
 
     def summary(self) -> Summary:
         """The summary of what was added so far, in Unix time, for a reader of the unfinished file."""
-        return parse_summary(b"".join(group for _, group in self._groups()), len(MAGIC), self.size)
+        return parse_summary(b"".join(group for _, group in self._groups()), self.size)
 
     def _groups(self) -> Iterator[tuple[Opcode, bytes | bytearray]]:
         """The records of the summary by kind."""
@@ -229,8 +229,17 @@ def disk_errors(path: Path) -> Iterator[None]:
     """Turns an OSError of writing the file into a FileError that says what to do."""
     try:
         yield
+    except FileNotFoundError as error:
+        raise FileError(
+            f"{path}: no longer exists: the file or its directory was removed or renamed during the recording"
+        ) from error
     except OSError as error:
-        raise _disk_failed(path, error) from error
+        what, first = f"writing failed ({error.strerror})", "see to the disk and its connection"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            what, first = "the disk is full", "free some space"
+        elif error.errno == errno.EFBIG:
+            what, first = "no file may be larger here", "record in parts (recording.split_mb)"
+        raise FileError(f"{path}: {what}; {first}, then `flowrec recover {path}` saves what was recorded") from error
 
 
 def not_writable(path: Path, error: OSError) -> FileError:
@@ -240,16 +249,3 @@ def not_writable(path: Path, error: OSError) -> FileError:
     if isinstance(error, BlockingIOError):
         return FileError(f"{path}: is being written by another process just now; choose another name with --out")
     return FileError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
-
-
-def _disk_failed(path: Path, error: OSError) -> FileError:
-    if error.errno == errno.ENOENT:
-        return FileError(
-            f"{path}: no longer exists: the file or its directory was removed or renamed during the recording"
-        )
-    what, first = f"writing failed ({error.strerror})", "see to the disk and its connection"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        what, first = "the disk is full", "free some space"
-    elif error.errno == errno.EFBIG:
-        what, first = "no file may be larger here", "record in parts (recording.split_mb)"
-    return FileError(f"{path}: {what}; {first}, then `flowrec recover {path}` saves what was recorded")

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from flowrec.core import SessionError, UsageError, append_line, refuse_irregular
 from flowrec.store.byte_source import open_bytes
-from flowrec.store.session_path import UrlPath, on_this_machine
+from flowrec.store.session_path import on_this_machine
 from flowrec.store.traffic import MissingError
 
 NOTES_SUFFIX = ".notes.jsonl"
@@ -53,7 +53,9 @@ def read_notes(session: Path, key: str) -> list[Note]:
     ------
     SessionError : the file can not be read.
     """
-    return [note for line in _lines(notes_content(notes_file(session))) if (note := _parse(line, key)) is not None]
+    lines = notes_content(notes_file(session)).split(b"\n")
+    notes = (_parse(line, key) for line in lines if 0 < len(line) <= _LINE_LIMIT)
+    return [note for note in notes if note is not None]
 
 
 def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
@@ -82,26 +84,12 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
 
 def notes_content(path: Path) -> bytes:
     """The bytes of a file of notes; none where there is no file. SessionError if it can not be read."""
-    if isinstance(path, UrlPath):
-        try:
-            with contextlib.closing(open_bytes(path)) as source:
-                return source.read(0, min(source.size, _FILE_LIMIT))
-        except (
-            MissingError
-        ):  # also where access is refused: S3 does not tell who may not list a bucket what is not there
-            return b""
-    refuse_irregular(path, SessionError)
     try:
-        with path.open("rb") as file:
-            return file.read(_FILE_LIMIT)
-    except FileNotFoundError:
+        with contextlib.closing(open_bytes(path)) as source:
+            return source.read(0, min(source.size, _FILE_LIMIT))
+    # Also where access to a URL is refused: S3 does not tell who may not list a bucket what is not there.
+    except MissingError:
         return b""
-    except OSError as error:
-        raise SessionError(f"{path}: can not be read ({error.strerror}); check its permissions") from error
-
-
-def _lines(content: bytes) -> Iterator[bytes]:
-    return (line for line in content.split(b"\n") if 0 < len(line) <= _LINE_LIMIT)
 
 
 def _parse(line: bytes, key: str) -> Note | None:

@@ -172,16 +172,16 @@ class _Bucket(ObjectRequests):
         try:
             with _bucket_errors():
                 if first is None and not self._takes_suffix:
-                    raise OtherRangeError("", obstore.head(self._store, self._key)["size"])
+                    raise OtherRangeError("")
                 found = obstore.get(self._store, self._key, options={"range": wanted})
                 meta, (begin, end) = found.meta, found.range
                 data = bytes(found.bytes())
         except _NoRangeError:
             return Answer(b"", 0, 0, "")
-        except OtherRangeError:
-            if first is None and self._takes_suffix:
-                self._takes_suffix = False
-                return self._get(None, length, end_s)
+        except OtherRangeError as error:
+            if first is None:
+                with _bucket_errors():
+                    error.size = obstore.head(self._store, self._key)["size"]
             raise
         if len(data) != end - begin:
             raise TransientError(f"the server sent {len(data)} of {end - begin} bytes")

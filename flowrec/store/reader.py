@@ -13,12 +13,10 @@ from typing import Any, Self, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import COILS, Frame, SessionError, Tick, TopicTable, array_shapes, seconds
-from flowrec.store.byte_source import is_there
+from flowrec.core import COILS, Frame, SessionError, Tick, array_shapes, seconds
 from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
-from flowrec.store.roi import Region
-from flowrec.store.run_files import Run, RunFile
+from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.session_path import session_path
 
@@ -34,12 +32,16 @@ class SessionReader:
     Parameters
     ----------
     path : the session.
-    file : the same, where it is a single file that is open already.
+    run : its files, where they are known already.
 
     Attributes
     ----------
     path : as it was named.
     files : its files, in order.
+    topics : those that this flowrec knows, and those that the session declares.
+    region : window of most images that was recorded, the rest being black (roi.py); None: the images are not cut.
+    frame_bits : depth of the images.
+    recorded_fields : names of the message fields that the file has, by field of Tick, for the topics that it declares.
     part : which file of a run it is; None for all parts of a run together.
     keyframe_ns : stamp of the first tick where that is a keyframe, the state before this file began, from which a
         replay starts. None where the session begins with the run.
@@ -52,26 +54,20 @@ class SessionReader:
         whole run; on reading, damage.
     """
 
-    def __init__(self, path: Path | str, file: FileReader | None = None) -> None:
+    def __init__(self, path: Path | str, run: Run | None = None) -> None:
         self.path = session_path(path)
+        self._run = run or Run.at(self.path)
         self._cache: Cache = {}
         self._closed = False
         self._open: dict[int, FileReader] = {}  # the one that was used longest ago first
-        if file is not None or is_there(self.path):
-            self._open[0] = first = file or FileReader(self.path, self._cache)
-            self._run = Run(self.path, [RunFile.of(first)])
-        else:
-            self._run = Run.at(self.path)
         self.files = [file.path for file in self._run.files]
         self.part = self._run.part
         self.keyframe_ns = self.part.keyframe_ns if self.part is not None else None
         self.first_ns, self.last_ns = self._run.first_ns, self._run.last_ns
         self.outcome = self._run.outcome
-
-    @functools.cached_property
-    def topics(self) -> TopicTable:
-        """The topics that this flowrec knows, and those that the session declares."""
-        return self._file(0).topics
+        first = self.file(0)
+        self.topics, self.recorded_fields = first.topics, first.recorded_fields
+        self.region, self.frame_bits = first.region, first.frame_bits
 
     @functools.cached_property
     def _fields(self) -> list[set[str]]:
@@ -81,17 +77,7 @@ class SessionReader:
     @functools.cached_property
     def header(self) -> SessionHeader:
         """Configuration, chip, provenance and weights."""
-        return self._file(0).header
-
-    @functools.cached_property
-    def region(self) -> Region | None:
-        """Window of most images that was recorded, the rest being black (roi.py); None: the images are not cut."""
-        return self._file(0).region
-
-    @functools.cached_property
-    def frame_bits(self) -> int:
-        """Depth of the images."""
-        return self._file(0).frame_bits
+        return self.file(0).header
 
     @functools.cached_property
     def counts(self) -> dict[str, int]:
@@ -108,11 +94,6 @@ class SessionReader:
     def _coils(self) -> int:
         first = next(itertools.chain(self.messages("applied"), self.messages("currents")), None)
         return 3 if first is None else len(first.currents_a)
-
-    @property
-    def recorded_fields(self) -> dict[str, frozenset[str]]:
-        """Names of the message fields that the file has, by field of Tick, for the topics that it declares."""
-        return self._file(0).recorded_fields
 
     @property
     def duration_s(self) -> float:
@@ -138,7 +119,7 @@ class SessionReader:
                 continue
             # A file that is read from its beginning is compared with the counts in its index.
             late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
-            for stamp_ns, new in self._file(number).new_messages(late_ns, self._choose_fields(with_frames=with_frames)):
+            for stamp_ns, new in self.file(number).new_messages(late_ns, self._choose_fields(with_frames=with_frames)):
                 if not number or stamp_ns > file.first_ns:
                     tick = self.topics.with_messages(tick, stamp_ns, new)
                     yield tick
@@ -156,7 +137,7 @@ class SessionReader:
         for number in reversed(begun):
             missing = (wanted - known.keys()) & self._fields[number]
             if missing:
-                latest_ns, state = self._file(number).state_at(stamp_ns, missing)
+                latest_ns, state = self.file(number).state_at(stamp_ns, missing)
                 found_ns, known = max(found_ns, latest_ns), known | state
         return self.topics.with_messages(Tick(), found_ns, known)
 
@@ -217,7 +198,7 @@ class SessionReader:
         for number, file in enumerate(self._run.files):
             # A later part may begin with a copy of the last image of the part before: the same pixels.
             if file.first_ns <= stamp_ns <= file.last_ns and "frame" in self._fields[number]:
-                found_ns, state = self._file(number).state_at(stamp_ns, {"frame"})
+                found_ns, state = self.file(number).state_at(stamp_ns, {"frame"})
                 if found_ns == stamp_ns:
                     frame: Frame = state["frame"]
                     return frame
@@ -241,9 +222,10 @@ class SessionReader:
         """The files with messages of some topics, each with the stamp of its keyframe, which is skipped; else -1."""
         for number, file in enumerate(self._run.files):
             if self._fields[number] & fields:
-                yield self._file(number), file.first_ns if number else -1
+                yield self.file(number), file.first_ns if number else -1
 
-    def _file(self, number: int) -> FileReader:
+    def file(self, number: int) -> FileReader:
+        """One of its files, from 0; SessionError if it is not of the same run as the first."""
         file = self._open.pop(number, None)
         if file is None:
             if self._closed:

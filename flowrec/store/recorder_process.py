@@ -1,4 +1,4 @@
-"""The recorder in a process of its own: it outlives the run, and finishes the files however that has ended.
+"""The recorder of a run: a thread, or a process of its own that finishes the files however the run has ended.
 
 The run puts entries into two rings in shared memory (shared_queue.py); the process takes them. When the process of the
 run has ended, killed or not, its pipe is closed: the recorder then writes what is left in the rings and completes the
@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -31,14 +32,79 @@ from flowrec.core import (
     declared_topic,
     prioritise_thread,
 )
-from flowrec.store.recording import Recorder, RecordingPlan
+from flowrec.store.parts import Parts
+from flowrec.store.ring_buffer import RingBuffer
 from flowrec.store.run_files import partial_path
+from flowrec.store.segments import RecordingPlan
+from flowrec.store.session_file import Snapshot
 from flowrec.store.shared_queue import QueueReader, SharedQueue
+from flowrec.store.write_queue import WriteQueue
 
 MODULE = "flowrec.store.recorder_process"  # its process is known by its words: this, and the path of the session
 _NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
 _SILENT_S = 120.0  # without a byte written at the end of the run
 _REPORT_S = 0.2
+
+
+class RecorderThread:
+    """Records in a thread of this process, and ends with it.
+
+    Attributes
+    ----------
+    queue : takes the entries.
+    failure : of the recording.
+    remarks : what happens, as text.
+    """
+
+    def __init__(self, plan: RecordingPlan) -> None:
+        self.failure: BaseException | None = None
+        self.remarks: deque[str] = deque()
+        self.queue = WriteQueue(plan.options.queue_limit_bytes)
+        self.run = _files_of(plan, self.remarks.append)
+        self._low = plan.options.block
+        self._thread = threading.Thread(target=self._work, name="session-writer", daemon=True)
+        self._thread.start()
+
+    @property
+    def size(self) -> int:
+        """Bytes of the files so far."""
+        return self.run.size
+
+    @property
+    def files(self) -> list[Path]:
+        """The complete files, in order."""
+        return self.run.files
+
+    @property
+    def partial_path(self) -> Path:
+        """The file that is written at present."""
+        return self.run.partial_path
+
+    @property
+    def dropped(self) -> int:
+        """Images that were left out at the end."""
+        return self.run.dropped
+
+    def prioritise(self) -> bool:
+        """Let it write in real time, behind a loop that has that priority too; whether it is allowed."""
+        native_id = self._thread.native_id
+        return native_id is not None and prioritise_thread(native_id, Priority.WRITER)
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """Wait for the end of the recording; whether it has come in time."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        # Not in a live run: preempted by any other program, it would keep the interpreter's lock from the loop.
+        if self._low and sys.platform == "linux":  # only there has each thread a priority of its own
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        try:
+            self.run.record(self.queue)
+        except Exception as error:  # noqa: BLE001  `write` and `close` raise it in the control loop
+            self.failure = error
+            self.queue.abandon()
 
 
 class RecorderProcess:
@@ -62,15 +128,15 @@ class RecorderProcess:
         except OSError as error:
             raise SessionError(f"{plan.path}: its recorder does not start ({error})") from error
         try:
-            self._child.send((_portable(plan), self.queue.handles, plan.options.block))
+            self._child.send((_portable(plan), self.queue.handles))
             assert self._child.process.stdin is not None
             self.queue.wake_by(self._child.process.stdin.fileno())
-            kind, reason = self._child.receive()
+            refusal: str = self._child.receive()
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             raise SessionError(f"{plan.path}: its recorder does not start ({self._cause()})") from error
-        if kind != "ready":
+        if refusal:
             self._close()
-            raise SessionError(reason)
+            raise SessionError(refusal)
         self._listener = threading.Thread(target=self._listen, name="recorder", daemon=True)
         self._listener.start()
 
@@ -119,14 +185,9 @@ class RecorderProcess:
         kind, value = answer
         if kind == "remark":
             self.remarks.append(value)
-        elif kind == "refused":
-            self.failure = SessionError(value)
-        elif kind == "failed":
-            self.failure = RuntimeError(value)
         else:
-            self.files, self.partial_path, self.dropped, failed = value
-            if failed is not None:
-                self._take(failed)
+            self.files, self.partial_path, self.dropped, failure = value
+            self.failure = failure or self.failure
             self._ended.set()
 
     def _cause(self) -> str:
@@ -137,6 +198,12 @@ class RecorderProcess:
         """The process ends by itself, when its pipe is closed."""
         self._child.finish()
         self.queue.close()
+
+
+def _files_of(plan: RecordingPlan, tell: Callable[[str], None]) -> Parts | RingBuffer:
+    """The files that a plan is recorded to."""
+    kind = RingBuffer if isinstance(plan.options.files, Snapshot) else Parts
+    return kind(plan, tell)
 
 
 def _portable(plan: RecordingPlan) -> tuple[RecordingPlan, list[tuple[str, str]]]:
@@ -151,30 +218,30 @@ def _work() -> None:
         signal.signal(each, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed does not get between the answers
-    (plan, topics), handles, low = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+    (plan, topics), handles = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
     table = TopicTable(declared_topic(path, text) for path, text in topics)
     plan = replace(plan, options=replace(plan.options, topics=table))
-    if low and sys.platform == "linux":
+    if plan.options.block and sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     queue = QueueReader(handles, sys.stdin.fileno())
     try:
-        recorder = Recorder(plan, lambda text: _answer(answers, "remark", text))
+        recorder = _files_of(plan, lambda text: _answer(answers, ("remark", text)))
     except SessionError as error:
-        _answer(answers, "refused", str(error))
+        _answer(answers, str(error))
         return
-    _answer(answers, "ready", None)
-    failed: tuple[str, str] | None = None
+    _answer(answers, "")
+    failure: Exception | None = None
     try:
         threading.Thread(target=_work_beside, args=(recorder, queue), daemon=True).start()
         recorder.record(queue)
     except SessionError as error:
-        failed = "refused", str(error)
+        failure = SessionError(str(error))  # others may not be pickled
     except Exception as error:  # noqa: BLE001  the run raises it
-        failed = "failed", f"{type(error).__name__}: {error}"
-    _answer(answers, "ended", (recorder.files, recorder.partial_path, recorder.dropped, failed))
+        failure = RuntimeError(f"{type(error).__name__}: {error}")
+    _answer(answers, ("ended", (recorder.files, recorder.partial_path, recorder.dropped, failure)))
 
 
-def _work_beside(recorder: Recorder, queue: QueueReader) -> None:
+def _work_beside(recorder: Parts | RingBuffer, queue: QueueReader) -> None:
     """Load what draws the file, which takes a second, before the run has ended; tell the size of the files."""
     from flowrec.physics import sample
 
@@ -188,9 +255,9 @@ def _work_beside(recorder: Recorder, queue: QueueReader) -> None:
         time.sleep(_REPORT_S)
 
 
-def _answer(answers: IO[bytes], kind: str, value: object) -> None:
+def _answer(answers: IO[bytes], value: object) -> None:
     with contextlib.suppress(BrokenPipeError):  # the run has ended: nobody asks
-        answers.write(pickle.dumps((kind, value)))
+        answers.write(pickle.dumps(value))
         answers.flush()
 
 

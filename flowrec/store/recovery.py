@@ -23,7 +23,6 @@ from flowrec.core import (
 from flowrec.store.audit import disagreements, edits_of
 from flowrec.store.channels import SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
-from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.mcap_writer import disk_errors, new_mcap
 from flowrec.store.reader import SessionReader
@@ -179,8 +178,8 @@ def _recover(path: Path, out: Path | None) -> Recovered:
     try:
         with contents:
             kept = _copy_intact(contents, draft)
-        done = _verify(draft)
-        if done is None:
+        duration_s = _verify(draft)
+        if duration_s is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
         _refuse_if_taken(target)
         _rename(draft, target)
@@ -194,7 +193,7 @@ def _recover(path: Path, out: Path | None) -> Recovered:
             draft.unlink(missing_ok=True)
     if partial and target == final:
         path.unlink()
-    return Recovered(target, kept.ticks, done.duration_s, kept.lost_bytes, kept.lost)
+    return Recovered(target, kept.ticks, duration_s, kept.lost_bytes, kept.lost)
 
 
 def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
@@ -224,12 +223,8 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
 
 def _left_out(contents: SessionContents) -> frozenset[str]:
     """The topics that the run was not to record; none where its settings can not be read."""
-    from flowrec.stages import config_from_toml
-
     try:
-        header = contents.header
-        config = config_from_toml(header.config_toml, "config.toml", header.provenance)
-        return left_out(config.recording.leave_out, contents.topics)
+        return left_out(contents.header.config().recording.leave_out, contents.topics)
     except FlowrecError:
         return frozenset()
 
@@ -241,8 +236,8 @@ def _nothing_on_disk(path: Path) -> NothingSavedError:
 def _check_intact(path: Path) -> Recovered | None:
     """A file of which every chunk is intact; None for any other."""
     try:
-        with SessionReader(path, file := FileReader(path)) as reader:
-            _ = file.header
+        with SessionReader(path) as reader:
+            file, _ = reader.file(0), reader.header
             for _tick in reader.ticks():
                 pass
             for chunk in file.chunks:  # the rest: viewer topics
@@ -254,15 +249,15 @@ def _check_intact(path: Path) -> Recovered | None:
         return None
 
 
-def _verify(draft: Path) -> Recovered | None:
-    """A file that was just written; None unless every message is as it was meant, and the index agrees with them."""
+def _verify(draft: Path) -> float | None:
+    """Length in s of a new file; None unless every message is as it was meant, and the index agrees with them."""
     try:
-        with SessionReader(draft, file := FileReader(draft)) as reader:
-            _ = file.header
+        with SessionReader(draft) as reader:
+            file, _ = reader.file(0), reader.header
             scanned = scan(file.source, digests=True)
             if scanned.lost_bytes or edits_of(file, scanned) != [] or any(disagreements(file, scanned)):
                 return None
-            return Recovered(draft, reader.counts.get("track", 0), reader.duration_s)
+            return reader.duration_s
     except SessionError:
         return None
 

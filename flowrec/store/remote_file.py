@@ -57,7 +57,7 @@ _remembering = threading.Lock()
 
 
 class RemoteFile:
-    """An object at a URL (ByteSource).
+    """An object at a URL, whose bytes are read as those of a LocalFile.
 
     Attributes
     ----------
@@ -86,6 +86,7 @@ class RemoteFile:
         self.size, self.version = self._object.tail.size, self._object.tail.version
 
     def read(self, offset: int, length: int) -> bytes:
+        """As of a LocalFile."""
         if not self._closer.alive:
             raise SessionError(f"{self.path}: has been closed; open the session again")
         end = min(offset + length, self.size)
@@ -128,6 +129,7 @@ class RemoteFile:
                 self._ahead.append(_Ahead(first, end, waits, self._threads.submit(self._range, first, end - first)))
 
     def close(self) -> None:
+        """Release it; garbage collection releases it, too."""
         self._closer()
 
     def _take_ahead(self, offset: int, end: int) -> Future[Answer] | None:

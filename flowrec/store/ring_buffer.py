@@ -17,10 +17,9 @@ from flowrec.store.channels import FRAMES
 from flowrec.store.chunk import ChunkEncoder, Sink, copy_chunks
 from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.run_files import partial_path, snapshot_path
-from flowrec.store.segments import Segment, SegmentedRun
+from flowrec.store.segments import RecordingPlan, Segment, SegmentedRun
 from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
-from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.write_queue import Counters, EncodedMessages, Entry, NewMessages
 
 _SEGMENT_S, _SEGMENTS = 1.0, 8  # length of a segment in s, at most this fraction of the ring
@@ -34,8 +33,8 @@ class _SnapshotFile(SessionFile):
     ----------
     until_ns : stamp after which it ends.
     events : in it, as text.
-    shortage : for the outcome, where the ring was too small.
-    first, last : segments in it; `last` is None, and `outcome` empty, until it ends.
+    outcome : for its end; before that, what is said of a ring that was too small.
+    first, last : segments in it; `last` is None until it ends.
     """
 
     def __init__(
@@ -44,7 +43,6 @@ class _SnapshotFile(SessionFile):
         super().__init__(path, header, options, limit_bytes=limit_bytes)
         self.until_ns = 0
         self.events: list[str] = []
-        self.shortage: dict[str, str] = {}
         self.first = first
         self.last: _RingSegment | None = None
         self.outcome: dict[str, str] = {}
@@ -54,13 +52,14 @@ class _SnapshotFile(SessionFile):
 class _RingSegment(Segment):
     """Consecutive ticks: in memory, or written to a snapshot."""
 
+    file: _SnapshotFile | None
+
     def __init__(self, encoder: ChunkEncoder, state: EncodedMessages, keyframe_ns: int | None) -> None:
         super().__init__(encoder, keyframe_ns)
         self.state = state  # at the keyframe
         self.sequences = Counter(encoder.sequences)
         self.image: list[SealedChunk] = []  # the last one before it
         self.chunks: list[SealedChunk] = []
-        self.snapshot: _SnapshotFile | None = None
         self.discarded = False  # too old before all of its images had come
         encoder.sink = self._keep(self.chunks)
 
@@ -70,23 +69,21 @@ class _RingSegment(Segment):
         return sum(len(chunk.data) for chunks in (self.chunks, self.image) for chunk in chunks)
 
     def add(self, entry: Entry) -> None:
-        if self.snapshot is not None:
-            self.snapshot.note(entry.stamp_ns)
         if not self.discarded:
-            self.encoder.add(entry)
+            super().add(entry)
 
     def add_keyframe_image(self, entry: Entry) -> None:
-        if self.snapshot is not None and self.snapshot.first is not self:
+        if self.file is not None and self.file.first is not self:
             return  # the segment before it is in the same file
         sink = self.encoder.sink
-        self.encoder.sink = self._keep(self.image) if self.snapshot is None else self.snapshot.put
+        self.encoder.sink = self._keep(self.image) if self.file is None else self.file.put
         self.encoder.add(entry)
         self.encoder.seal((FRAMES,))
         self.encoder.sink = sink
 
     def write_to(self, snapshot: _SnapshotFile) -> None:
         """Write the chunks in memory, and later entries, to a file."""
-        self.snapshot = snapshot
+        self.file = snapshot
         snapshot.put(self.chunks)
         self.chunks, self.image, self.state = [], [], {}
         self.encoder.sink = snapshot.put
@@ -97,27 +94,12 @@ class _RingSegment(Segment):
 
 
 class RingBuffer(SegmentedRun[_RingSegment]):
-    """Keeps the last seconds of the entries, and writes files around events.
+    """Keeps the last seconds of the entries, and writes files around events."""
 
-    Parameters
-    ----------
-    settings : what a snapshot contains.
-    tell : receives what happens, as text.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        header: SessionHeader,
-        options: WriterOptions,
-        camera: ChipCamera | None,
-        settings: Snapshot,
-        run: str,
-        tell: Callable[[str], None],
-    ) -> None:
-        super().__init__(path, header, options, camera, run)
-        self._settings = settings
-        self._tell = tell
+    def __init__(self, plan: RecordingPlan, tell: Callable[[str], None]) -> None:
+        super().__init__(plan, tell)
+        assert isinstance(plan.options.files, Snapshot)
+        self._settings = settings = plan.options.files
         self._before_ns, self._after_ns = nanoseconds(settings.before_s), nanoseconds(settings.after_s)
         self._segment_ns = min(nanoseconds(_SEGMENT_S), self._before_ns // _SEGMENTS)
         self._limit_bytes = int(1e6 * settings.megabytes)
@@ -129,7 +111,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         self._snapshot: _SnapshotFile | None = None
         self.open.append(self._segment())
         # Make a file and remove it, so that an error is reported at the start and not at the event.
-        file = SessionFile(snapshot_path(path, 1), header, options)
+        file = SessionFile(snapshot_path(plan.path, 1), plan.header, plan.options)
         file.partial_path.unlink(missing_ok=True)
         file.close()  # after that, for another process may make a file of this name as soon as it is not locked
 
@@ -166,7 +148,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
 
     def _end(self, segment: _RingSegment) -> None:
         """Add a complete segment to the ring or to its snapshot."""
-        snapshot = segment.snapshot
+        snapshot = segment.file
         segment.encoder.seal()
         if snapshot is not None:
             snapshot.encoders.remove(segment.encoder)
@@ -182,7 +164,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         if self._free:
             encoder = self._free.pop()
         else:
-            encoder = self._encoder(_discard)
+            encoder = self._encoder(lambda _chunks: None)  # until a segment uses it
             encoder.sequences = self._sequences
         return _RingSegment(encoder, dict(self._state), self._last_ns)
 
@@ -198,7 +180,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
 
     def _segments(self) -> list[_RingSegment]:
         """The segments in memory, oldest first."""
-        return [*self._ring, *(each for each in self.open if each.snapshot is None and not each.discarded)]
+        return [*self._ring, *(each for each in self.open if each.file is None and not each.discarded)]
 
     def _is_old(self, segment: _RingSegment) -> bool:
         """True if the ring is long enough without the segments before this one."""
@@ -238,13 +220,13 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         first = segments[0]
         held_s = seconds(stamp_ns - (stamp_ns if first.begin_ns is None else first.begin_ns))
         self._number += 1
-        header = replace(self._header, part=Part(self._run, self._number, "snapshot", first.keyframe_ns, event))
+        header = replace(self._header, part=Part(self._plan.run, self._number, "snapshot", first.keyframe_ns, event))
         path = snapshot_path(self._path, self._number)
         self._snapshot = snapshot = _SnapshotFile(path, header, self._options, self._limit_bytes, first)
         self._unfinished.append(snapshot)
         if self._is_short:
             short = f"{held_s:.1f} of {self._settings.before_s:g} s before the event"
-            snapshot.shortage = {"short_of_memory": short}
+            snapshot.outcome = {"short_of_memory": short}
         if first.keyframe_ns is not None:
             encoder = self._encoder(snapshot.put)
             # Numbered as if they had been written just before what follows.
@@ -265,7 +247,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         snapshot = self._snapshot
         assert snapshot is not None
         others = {"also": "; ".join(snapshot.events[1:])} if len(snapshot.events) > 1 else {}
-        snapshot.last, snapshot.outcome = self.open[-1], {**outcome, **snapshot.shortage, **others}
+        snapshot.last, snapshot.outcome = self.open[-1], {**outcome, **snapshot.outcome, **others}
         self._snapshot, self._is_short = None, False
         self._cut(self._segment())
 
@@ -293,7 +275,3 @@ class SnapshotTrigger:
                 self._dropped, self._dropped_ns = dropped, stamp_ns
                 return "images are lost" if began else ""
         return ""
-
-
-def _discard(_chunks: list[SealedChunk]) -> None:
-    """The sink of an encoder that no segment uses yet."""

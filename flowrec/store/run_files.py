@@ -242,8 +242,8 @@ def files_of(path: Path) -> list[Path]:
     files = run_files(path)
     found = _parts_among(files)
     _refuse_unfinished(path, found, [file for file in files if file.name.endswith(PARTIAL_SUFFIX)])
-    numbers = {part_number(file) for file in found}
-    missing = next((number for number in range(1, max(numbers, default=0)) if number not in numbers), None)
+    numbers = set(map(part_number, found))
+    missing = min(set(range(1, max(numbers, default=0))) - numbers, default=None)
     if missing is not None:
         raise SessionError(
             f"{part_path(path, missing)}: is missing from its run, of which there are {len(found)} parts;"
@@ -337,8 +337,7 @@ def session_sha256(files: Sequence[Path]) -> str:
     """SHA-256 of a session, by which a replay names its parent: of its file, or of its parts in order."""
     digest = hashlib.sha256()
     for path in files:
-        source = open_bytes(path)
-        with contextlib.closing(source):
+        with contextlib.closing(open_bytes(path)) as source:
             for offset in range(0, source.size, _HASHED_BYTES):
                 source.prefetch((at, _HASHED_BYTES) for at in range(offset, offset + 4 * _HASHED_BYTES, _HASHED_BYTES))
                 digest.update(source.read(offset, min(_HASHED_BYTES, source.size - offset)))

@@ -142,7 +142,6 @@ class Scan:
             self.last[channel] = at = (log_ns, offset)
             self.first.setdefault(channel, at)
             if self._start_unix_ns is not None:
-                assert isinstance(payload, memoryview)
                 self.sums[channel] += message_digest(sequence, log_ns + self._start_unix_ns, payload)
 
 

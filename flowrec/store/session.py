@@ -120,17 +120,12 @@ class Session:
     @cached_property
     def config(self) -> ResolvedConfig:
         """The resolved configuration of the run; UsageError where it is not valid."""
-        from flowrec.stages import config_from_toml
-
-        where = f"{self.path}: config.toml inside"
-        return config_from_toml(self.header.config_toml, where, self.header.provenance)
+        return self.header.config(f"{self.path}: config.toml inside")
 
     @cached_property
     def chip(self) -> Chip:
         """The chip with its mask (h, w) and openings; ChipError where it is not valid."""
-        from flowrec.physics import chip_from_files
-
-        return chip_from_files(self.header.chip_png, self.header.chip_toml)
+        return self.header.chip()
 
     @cached_property
     def calibration(self) -> Calibration:
@@ -144,7 +139,7 @@ class Session:
         """The reader of the messages, by stamps in ns."""
         from flowrec.store.reader import SessionReader
 
-        return SessionReader(self.path)
+        return SessionReader(self.path, self.run)
 
     def ticks(self, start_s: float | None = None, *, with_frames: bool = True) -> Iterator[Tick]:
         """All ticks, or those at and after `start_s`, each with every message known by then.
@@ -331,17 +326,13 @@ def input_blamed(session: Session, config: ResolvedConfig | None, done: str) -> 
 
 
 def _absurd_numbers(session: Session) -> Iterator[str]:
-    from flowrec.core import Tick, invalid_numbers, message_of
+    from flowrec.core import invalid_numbers
 
-    before = Tick()
-    for tick in session.ticks(with_frames=False):
-        for topic in session.reader.topics.topics:
-            message = message_of(tick, topic.field)
-            if message is not None and message is not message_of(before, topic.field):
-                for name in invalid_numbers(message, _LARGEST_NUMBER):
-                    at_s = seconds(tick.stamp_ns - session.run.first_ns)
-                    yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or an impossibly large number"
-        before = tick
+    for topic in session.reader.topics.topics:
+        for message in session.messages(topic.field) if topic.field != "frame" else ():
+            for name in invalid_numbers(message, _LARGEST_NUMBER):
+                at_s = seconds(message.stamp_ns - session.run.first_ns)
+                yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or an impossibly large number"
 
 
 def card(title: str, rows: Iterable[tuple[str, str]], image: NDArray[np.uint8 | np.uint16] | None) -> str:

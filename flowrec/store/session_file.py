@@ -280,13 +280,23 @@ class SessionFile:
             self.check()
             self.add_chunks(chunks)
             return
-        own = copy_chunks(chunks)
+        own, nbytes = copy_chunks(chunks), sum(len(chunk.data) for chunk in chunks)
+
+        def write() -> None:
+            try:
+                if self.failure is None:
+                    self.add_chunks(own)
+            finally:
+                with self._written:
+                    self._waiting_bytes -= nbytes
+                    self._written.notify_all()
+
         with self._written:
             if self._limit_bytes is not None:
                 limit_bytes = self._limit_bytes
                 self._written.wait_for(lambda: self.failure is not None or self._waiting_bytes <= limit_bytes)
-            self._waiting_bytes += _size_of(own)
-        self._writing = self._aside(self._write_waiting, own)
+            self._waiting_bytes += nbytes
+        self._writing = self._aside(write)
 
     def add_chunks(self, chunks: list[SealedChunk]) -> None:
         """Write chunks at once."""
@@ -361,23 +371,14 @@ class SessionFile:
         )
         return self.failure
 
-    def _aside(self, work: Callable[..., None], *arguments: list[SealedChunk]) -> Future[None]:
+    def _aside(self, work: Callable[[], None]) -> Future[None]:
         """Run a function in the side thread; `failure` receives its error."""
 
         def run() -> None:
             with self._mark_failed():
-                work(*arguments)
+                work()
 
         return self._side.submit(run)
-
-    def _write_waiting(self, chunks: list[SealedChunk]) -> None:
-        try:
-            if self.failure is None:
-                self.add_chunks(chunks)
-        finally:
-            with self._written:
-                self._waiting_bytes -= _size_of(chunks)
-                self._written.notify_all()
 
     @contextlib.contextmanager
     def _mark_failed(self) -> Iterator[None]:
@@ -387,7 +388,3 @@ class SessionFile:
         except BaseException as error:
             self.failure = self.failure or error
             raise
-
-
-def _size_of(chunks: list[SealedChunk]) -> int:
-    return sum(len(chunk.data) for chunk in chunks)

@@ -10,13 +10,17 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Self
 
 from mcap.records import Attachment, Metadata, Statistics
 
 from flowrec.core import SessionError, __version__
 from flowrec.store.mcap_format import Summary
 from flowrec.store.mcap_reader import ForeignError, McapReader
+
+if TYPE_CHECKING:
+    from flowrec.physics import Chip
+    from flowrec.stages import ResolvedConfig
 
 FORMAT_VERSION = 1
 PROFILE = "flowrec"
@@ -59,7 +63,7 @@ class Part:
 
     run: str
     number: int
-    kind: Literal["part", "snapshot"] = "part"
+    kind: str = "part"
     keyframe_ns: int | None = None
     why: str = ""
 
@@ -91,6 +95,18 @@ class SessionHeader:
     part: Part | None = None
     start_unix_ns: int = 0
     pictures: Mapping[str, bytes] = field(default_factory=dict)
+
+    def config(self, where: str = "config.toml") -> ResolvedConfig:
+        """The resolved configuration; UsageError, which begins with `where`, if it is not valid."""
+        from flowrec.stages import config_from_toml
+
+        return config_from_toml(self.config_toml, where, self.provenance)
+
+    def chip(self) -> Chip:
+        """The chip with its mask (h, w) and openings; ChipError if it is not valid."""
+        from flowrec.physics import chip_from_files
+
+        return chip_from_files(self.chip_png, self.chip_toml)
 
     def is_same_run(self, other: SessionHeader) -> bool:
         """True if two headers differ in their part at most."""
@@ -281,5 +297,4 @@ def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
     if kind not in ("part", "snapshot") or not are_numbers or max(len(number), len(keyframe)) >= _DIGITS:
         what = f"{kind[:40]!r} {number[:40]!r}, carried from {keyframe[:40]!r}"
         raise ValueError(f"a record of a part with invalid values: {what}")
-    kind_of: Literal["part", "snapshot"] = "part" if kind == "part" else "snapshot"
-    return Part(facts.get("run", ""), int(number), kind_of, int(keyframe) if keyframe else None, facts.get("why", ""))
+    return Part(facts.get("run", ""), int(number), kind, int(keyframe) if keyframe else None, facts.get("why", ""))

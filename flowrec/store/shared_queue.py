@@ -155,7 +155,7 @@ class SharedQueue:
 
 
 class QueueReader:
-    """The end of the queue in the recorder; see EntryQueue.
+    """The end of the queue in the recorder; see WriteQueue.
 
     Parameters
     ----------
@@ -229,8 +229,7 @@ class QueueReader:
             self._last_ns = max(self._last_ns, found.stamp_ns)
             if self._words[_DROP] and "frame" in found.messages:
                 self.given_up += 1
-                others = {name: each for name, each in found.messages.items() if name != "frame"}
-                return found._replace(messages=others, dropped=found.dropped + 1)
+                return found.without_image()
             return found
         return None
 

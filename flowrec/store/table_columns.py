@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,8 @@ _COMMON = {
     TIME: ("float64", "the same in s, as in Session.at"),
     WALL: ("timestamp", "the same as time of day, UTC; empty in files that do not state when their clock was 0"),
 }
-_READ_WITH_PIXELS: dict[type, tuple[str, ...]] = {Frame: ("index", "image")}
+
+_READ_WITH_PIXELS = ("index", "image")  # of a Frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,7 @@ def columns_of(topic: str, topics: TopicTable = FIXED, coils: int = 3) -> tuple[
 def _columns_of_type(topic: str, message_type: type, coils: int) -> tuple[Column, ...]:
     columns = [Column(name, "", None, kind, (), unit_of(name), text) for name, (kind, text) in _COMMON.items()]
     for each in message_fields(message_type):
-        if each.name not in (STAMP, *_READ_WITH_PIXELS.get(message_type, ())):
+        if each.name != STAMP and (message_type is not Frame or each.name not in _READ_WITH_PIXELS):
             columns += _columns(each, coils)
     # A field that is called like a column of every table: the times of observations.
     return tuple(
@@ -100,7 +101,8 @@ def _columns(field: MessageField, coils: int) -> list[Column]:
     of_coils = shape == (COILS,) and field.kind == "vector"
     shape = (coils,) if of_coils else shape
     if len(shape) == 1 and (shape[0] in (2, 3) or of_coils) and not field.optional:
-        parts = _AXES[: int(shape[0])] if int(shape[0]) in (2, 3) else [str(coil + 1) for coil in range(coils)]
+        count = int(shape[0])
+        parts: Iterable[str | int] = _AXES[:count] if count in (2, 3) else range(1, count + 1)
         suffix = unit_suffix(field.name)
         stem = field.name.removesuffix(suffix)
         return [

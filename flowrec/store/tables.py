@@ -6,8 +6,7 @@ any length is streamed. https://arrow.apache.org/docs/python/data.html#record-ba
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -90,7 +89,7 @@ class Tables:
         names = [each.name for each in message_fields(declared.type)]
         cells = dict(zip(names, zip(*rows, strict=True), strict=True))
         stamps = np.fromiter(cells[STAMP], np.int64, len(rows))
-        arrays, flat = [], dict[str, NDArray[Any]]()
+        arrays = []
         for column in columns:
             if column.name == STAMP:
                 array = pa.array(stamps)
@@ -100,13 +99,11 @@ class Tables:
                 none = np.full(len(rows), not self._start_unix_ns)
                 array = pa.array((stamps + self._start_unix_ns).view("datetime64[ns]"), _type_of(column), mask=none)
             elif column.component is not None:
-                if column.field not in flat:
-                    width = sum(other.field == column.field for other in columns)
-                    if {len(cell) for cell in cells[column.field]} != {width}:
-                        what = f"{declared.path}: {column.field}"
-                        raise SessionError(f"{what} has not {width} numbers in each message, one a coil")
-                    flat[column.field] = _flat(cells[column.field], column.kind).reshape(len(rows), width)
-                array = pa.array(np.ascontiguousarray(flat[column.field][:, column.component]))
+                width = sum(other.field == column.field for other in columns)
+                if set(map(len, cells[column.field])) != {width}:
+                    what = f"{declared.path}: {column.field}"
+                    raise SessionError(f"{what} has not {width} numbers in each message, one a coil")
+                array = pa.array([cell[column.component] for cell in cells[column.field]], _type_of(column))
             elif column.shape:
                 array = _lists(column, cells[column.field])
             else:
@@ -122,20 +119,13 @@ def _type_of(column: Column) -> pa.DataType:
     return kind
 
 
-def _flat(cells: tuple[Any, ...], kind: str) -> NDArray[Any]:
-    """All elements of vectors or arrays one after the other; a vector is a tuple."""
-    if cells and isinstance(cells[0], tuple):
-        return np.fromiter(itertools.chain.from_iterable(cells), kind)
-    return np.concatenate([np.ravel(cell) for cell in cells]) if cells else np.zeros(0, kind)
-
-
 def _lists(column: Column, cells: tuple[Any, ...]) -> pa.Array:
     """Arrays of one number of dimensions and of any shape, None among them, as nested lists without a copy a number."""
     there = [cell for cell in cells if cell is not None]
-    shapes = np.array([(len(cell),) if isinstance(cell, tuple) else cell.shape for cell in there], np.int64)
+    shapes = np.array([np.shape(cell) for cell in there], np.int64)
     axes = len(column.shape)
     shapes = shapes.reshape(len(there), axes)  # also where there is none
-    values = pa.array(_flat(tuple(there), column.kind))
+    values = pa.array(np.concatenate([np.zeros(0, column.kind), *map(np.ravel, there)]))
     for axis in reversed(range(1, axes)):  # from the innermost lists to those of which a row has one
         length = column.shape[axis]
         if isinstance(length, int):
@@ -147,7 +137,7 @@ def _lists(column: Column, cells: tuple[Any, ...]) -> pa.Array:
     missing = np.array([cell is None for cell in cells])
     outer = column.shape[0]
     if isinstance(outer, int):
-        assert not missing.any()  # see columns.py
+        assert not missing.any()  # see table_columns.py
         return pa.FixedSizeListArray.from_arrays(values, outer)
     lengths = np.zeros(len(cells), np.int64)
     lengths[~missing] = shapes[:, 0]
@@ -161,17 +151,9 @@ def _offsets(lengths: NDArray[np.int64]) -> pa.Array:
 
 def observed_flow(observations: Observations) -> pa.Table:
     """Observations with a row each, in the columns OBSERVED; what is not stated is empty."""
-    n = len(observations.position_um)
-    none = np.full((n, 2), np.nan)
-    rolled = observations.rolled_um_s if observations.rolled_um_s is not None else none
-    time_s = observations.time_s if observations.time_s is not None else none[:, 0]
-    parts = (observations.position_um, observations.flow_um_s, observations.std_um_s[:, None], rolled, time_s[:, None])
-    empty = {
-        "own_u_um_s": observations.rolled_um_s is None,
-        "own_v_um_s": observations.rolled_um_s is None,
-        "time_s": observations.time_s is None,
-    }
-    return _table(OBSERVED, np.hstack(parts), empty)
+    rolled = (None, None) if observations.rolled_um_s is None else observations.rolled_um_s.T
+    place, flow = observations.position_um.T, observations.flow_um_s.T
+    return _table(OBSERVED, (*place, *flow, observations.std_um_s, *rolled, observations.time_s))
 
 
 def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
@@ -181,18 +163,16 @@ def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
     ----------
     fluid : (h, w), where the chip holds fluid.
     """
-    return _table(VALUES, values_of(field, fluid), dict.fromkeys(("std_u_um_s", "std_v_um_s"), field.std_um_s is None))
+    columns = zip(VALUES, values_of(field, fluid).T, strict=True)
+    return _table(VALUES, [None if field.std_um_s is None and "std" in name else values for name, values in columns])
 
 
-def _table(columns: Mapping[str, str], values: NDArray[Any], empty: Mapping[str, bool]) -> pa.Table:
-    schema = pa.schema(
-        [
-            pa.field(name, pa.float64(), metadata={"unit": unit_of(name), "meaning": text})
-            for name, text in columns.items()
-        ]
-    )
-    arrays = [
-        pa.nulls(len(values), pa.float64()) if empty.get(name) else pa.array(np.ascontiguousarray(values[:, number]))
-        for number, name in enumerate(columns)
+def _table(meanings: Mapping[str, str], columns: Sequence[NDArray[Any] | None]) -> pa.Table:
+    """A table of numbers; a column that is None is empty."""
+    fields = [
+        pa.field(name, pa.float64(), metadata={"unit": unit_of(name), "meaning": text})
+        for name, text in meanings.items()
     ]
-    return pa.Table.from_arrays(arrays, schema=schema)
+    missing = [None] * next(len(each) for each in columns if each is not None)
+    arrays = [pa.array(missing if each is None else np.ascontiguousarray(each), pa.float64()) for each in columns]
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))

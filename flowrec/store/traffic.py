@@ -25,7 +25,7 @@ class TransientError(Exception):
 
 
 class MissingError(SessionError):
-    """No object of that name can be read: there is none, or access is refused."""
+    """No file or object of that name can be read: there is none, or access to the object is refused."""
 
 
 class HiddenError(MissingError):

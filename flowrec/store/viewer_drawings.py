@@ -7,7 +7,7 @@ highest speed of the first field; solid is black.
 from __future__ import annotations
 
 import functools
-import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import M_PER_UM, Estimate, FlowField, Route, Track
 from flowrec.store.codec import Payload, byte_field_head
-from flowrec.store.schema import foxglove_schema
-from flowrec.store.viewer_scene import CHIP, MAP, Picture, ViewerScene, speed_um_s
+from flowrec.store.viewer_scene import CHIP, MAP, STILL, Picture, ViewerScene, speed_um_s
 
 _GRID_DATA, _CIRCLES, _POINTS, _TRANSFORMS = 9, 1, 2, 1  # numbers of fields
 # The robot and the goal are drawn as rings: a single point of Rerun's default size is hidden by the path.
@@ -26,6 +25,7 @@ _RADII_OF_GOAL = 2.5
 _LINE_PX = 1.5  # of the image, at most; thinner on a small one
 _LINE_SHARE = 1.0 / 200.0  # of the image's width
 _ROUNDING = np.uint32(1 << 11)  # half of the last bit kept of a float's 23; the rest are 0 and compress
+_NO_COLOUR = fg.Color(r=0.0, g=0.0, b=0.0, a=0.0)
 Rgba = tuple[int, int, int, int]
 _ROBOT, _UNSEEN, _PATH, _GOAL = (255, 112, 32, 255), (200, 200, 200, 255), (0, 216, 255, 255), (64, 255, 96, 255)
 
@@ -88,13 +88,13 @@ def route_mark(stamp_ns: int, scene: ViewerScene) -> Payload:
     parts: Payload = ()
     if scene.route is not None:
         way_px = scene.picture.to_px(thin_line(scene.route.waypoints_um, scene.picture.um_per_px))
-        parts += _line(stamp, way_px, "LINE_STRIP", width_px, _PATH)
+        parts += _line(stamp, way_px, fg.PointsAnnotationType.LineStrip, width_px, _PATH)
     if scene.goal_um is not None:
         place, ring_px = scene.picture.to_px(scene.goal_um), _RADII_OF_GOAL * scene.robot_um / scene.picture.um_per_px
         x_px, y_px = place.tolist()
         ends = np.array([(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
         parts += _circle(stamp, (x_px, y_px), ring_px, width_px, _GOAL)
-        parts += _line(stamp, place + ring_px * ends, "LINE_LIST", width_px, _GOAL)
+        parts += _line(stamp, place + ring_px * ends, fg.PointsAnnotationType.LineList, width_px, _GOAL)
     return parts
 
 
@@ -149,7 +149,7 @@ def grid(field: FlowField, _scene: ViewerScene) -> Payload:
 
 def _pose(x_um: float, y_um: float) -> fg.Pose:
     place = fg.Vector3(x=M_PER_UM * x_um, y=M_PER_UM * y_um, z=0.0)
-    return fg.Pose(position=place, orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+    return fg.Pose(position=place, orientation=STILL)
 
 
 @functools.lru_cache(maxsize=2)  # asked for twice
@@ -196,29 +196,25 @@ def _float_fields(*names: str) -> list[fg.PackedElementField]:
 def _circle(stamp: bytes, place_px: tuple[float, float], radius_px: float, width_px: int, rgba: Rgba) -> Payload:
     """A circle as a part of ImageAnnotations."""
     x, y = place_px
-    place = foxglove_schema("CircleAnnotation").wire(position={"x": x, "y": y}).SerializeToString()
-    look = _circle_look(radius_px, width_px, rgba)
-    return _part(_CIRCLES, stamp, place, look)
+    circle = fg.CircleAnnotation(position=fg.Point2(x=x, y=y), diameter=2.0 * radius_px, **_look(width_px, rgba))
+    return _part(_CIRCLES, stamp, circle.encode())
 
 
-@functools.lru_cache(maxsize=8)
-def _circle_look(radius_px: float, width_px: int, rgba: Rgba) -> bytes:
-    wire = foxglove_schema("CircleAnnotation").wire
-    look = wire(diameter=2.0 * radius_px, thickness=_thickness(width_px), fill_color={}, outline_color=_colour(rgba))
-    data: bytes = look.SerializeToString()
-    return data
-
-
-def _line(stamp: bytes, points_px: NDArray[np.float64], kind: str, width_px: int, rgba: Rgba) -> Payload:
+def _line(
+    stamp: bytes, points_px: NDArray[np.float64], kind: fg.PointsAnnotationType, width_px: int, rgba: Rgba
+) -> Payload:
     """A line as a part of ImageAnnotations."""
-    line = foxglove_schema("PointsAnnotation").wire(
-        type=kind,
-        points=[{"x": x, "y": y} for x, y in points_px.tolist()],
-        outline_color=_colour(rgba),
-        fill_color={},
-        thickness=_thickness(width_px),
-    )
-    return _part(_POINTS, stamp, line.SerializeToString())
+    points = [fg.Point2(x=x, y=y) for x, y in points_px.tolist()]
+    return _part(_POINTS, stamp, fg.PointsAnnotation(type=kind, points=points, **_look(width_px, rgba)).encode())
+
+
+def _look(width_px: int, rgba: Rgba) -> dict[str, Any]:
+    red, green, blue, alpha = (value / 255.0 for value in rgba)
+    return {
+        "thickness": max(_LINE_PX, _LINE_SHARE * width_px),
+        "fill_color": _NO_COLOUR,
+        "outline_color": fg.Color(r=red, g=green, b=blue, a=alpha),
+    }
 
 
 def _part(number: int, *content: bytes) -> Payload:
@@ -226,17 +222,4 @@ def _part(number: int, *content: bytes) -> Payload:
     return byte_field_head(number, sum(map(len, content))), *content
 
 
-def _thickness(width_px: int) -> float:
-    return max(_LINE_PX, _LINE_SHARE * width_px)
-
-
-def _colour(rgba: Rgba) -> dict[str, float]:
-    return {name: value / 255.0 for name, value in zip("rgba", rgba, strict=True)}
-
-
 _IN_CHIP = fg.PoseInFrame(frame_id=CHIP).encode()
-
-
-def is_finite(place: NDArray[np.float64]) -> bool:
-    """True if a place (2,) can be drawn on an image."""
-    return all(map(math.isfinite, place.tolist()))

@@ -63,8 +63,7 @@ def robot_flow(robot: Estimate | Track, scene: ViewerScene) -> Payload:
     """The flow where the robot is."""
     flow = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
     numbers, _ = _beside_map(scene, scene.place_um(robot.position_um), flow)
-    data: bytes = ROBOT_FLOW.wire(**numbers, map_error_share=scene.map_error_share).SerializeToString()
-    return (data,)
+    return (ROBOT_FLOW.wire(**numbers, map_error_share=scene.map_error_share).SerializeToString(),)
 
 
 def observation(observations: Observations, scene: ViewerScene) -> Payload:
@@ -74,7 +73,7 @@ def observation(observations: Observations, scene: ViewerScene) -> Payload:
         return (OBSERVATION.wire(count=0).SerializeToString(),)
     u, v = flow = observations.flow_um_s[-1].tolist()
     numbers, (map_u, map_v) = _beside_map(scene, scene.place_um(observations.position_um[-1]), flow)
-    data: bytes = OBSERVATION.wire(
+    message = OBSERVATION.wire(
         **numbers,
         flow_x_um_s=u,
         flow_y_um_s=v,
@@ -82,8 +81,8 @@ def observation(observations: Observations, scene: ViewerScene) -> Payload:
         map_x_um_s=map_u,
         map_y_um_s=map_v,
         count=count,
-    ).SerializeToString()
-    return (data,)
+    )
+    return (message.SerializeToString(),)
 
 
 def route_flow(route: Route, scene: ViewerScene) -> Payload:
@@ -102,13 +101,13 @@ def route_flow(route: Route, scene: ViewerScene) -> Payload:
             height, width = scene.field.std_um_s.shape[:2]
             columns, rows = np.nan_to_num(np.rint(way_um / scene.field.um_per_px)).astype(np.int64).T
             std = scene.field.std_um_s[rows.clip(0, height - 1), columns.clip(0, width - 1)].astype(np.float64)
-    data: bytes = ROUTE_FLOW.wire(
+    message = ROUTE_FLOW.wire(
         distance_um=distance_um(way_um).tolist(),
         map_um_s=np.hypot(*flow.T).tolist(),
         along_um_s=(flow * along).sum(axis=1).tolist(),
         std_um_s=np.sqrt((std**2).mean(axis=1)).tolist(),
-    ).SerializeToString()
-    return (data,)
+    )
+    return (message.SerializeToString(),)
 
 
 def _beside_map(

@@ -35,7 +35,7 @@ HEIGHT_M = 0.2
 _HALF_PX = 0.5
 _RADIUS_UM = 60.0  # of a robot whose size is not known
 _Number = TypeVar("_Number", float, NDArray[np.float64])
-_STILL = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+STILL = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +119,11 @@ class ChipCamera:
     def of(cls, header: SessionHeader) -> ChipCamera | None:
         """The camera of a session; None where its settings or its chip can not be read, as in a damaged file."""
         # Loaded late: listing sessions needs no settings.
-        from flowrec.physics import chip_from_files
-        from flowrec.stages import calibration_of, config_from_toml
+        from flowrec.stages import calibration_of
 
         try:
-            config = config_from_toml(header.config_toml, "config.toml", header.provenance)
-            calibration = calibration_of(config, chip_from_files(header.chip_png, header.chip_toml))
+            config = header.config()
+            calibration = calibration_of(config, header.chip())
         except FlowrecError:
             return None
         return cls(calibration, (config.camera.width_px, config.camera.height_px), config.robot.radius_um)
@@ -197,7 +196,7 @@ class ViewerScene:
             field = messages.get(name)
             if isinstance(field, FlowField) and drawable(field):
                 if self.top_um_s is None:
-                    self.top_um_s = brightest_um_s(field)
+                    self.top_um_s = float(speed_um_s(field).max()) or 1.0
                 if name == "refined":
                     self._refined = field
                 if name == "refined" or self._refined is None:
@@ -217,7 +216,7 @@ class ViewerScene:
 
     def transforms(self) -> list[fg.FrameTransform]:
         """The tree of the frames that are known."""
-        chip = fg.FrameTransform(parent_frame_id=ROOT, child_frame_id=CHIP, translation=fg.Vector3(), rotation=_STILL)
+        chip = fg.FrameTransform(parent_frame_id=ROOT, child_frame_id=CHIP, translation=fg.Vector3(), rotation=STILL)
         return [chip, *(picture.transform() for picture in (self.picture, self.map) if picture is not None)]
 
     def stamp(self, stamp_ns: int) -> bytes:
@@ -251,8 +250,3 @@ def speed_um_s(field: FlowField) -> NDArray[np.float32]:
         speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
     np.nan_to_num(speed, copy=False, posinf=0.0)
     return speed
-
-
-def brightest_um_s(field: FlowField) -> float:
-    """The end of the colour scale of a session whose first field this is."""
-    return float(speed_um_s(field).max()) or 1.0

@@ -55,9 +55,7 @@ class ViewerTopics:
             if view.path not in left_out:
                 self._views.setdefault(view.input, []).append(view)
         self._scene = ViewerScene() if scene is None else scene
-        self._placed: tuple[object, object] = (None, None)  # picture and map whose cameras were described last
-        self._goal: object = None
-        self._marked: tuple[object, ...] = (None, None, None)  # route, goal and picture that were drawn last
+        self._drawn: dict[str, tuple[object, ...]] = {"frames": (None, None), "goal": (None,)}  # what, by name
         self._robot_ns = _NEVER
 
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
@@ -75,28 +73,24 @@ class ViewerTopics:
     def _inputs(self, messages: Mapping[str, Any]) -> Iterator[tuple[str, int, Any]]:
         """Name, stamp in ns and message of what viewer topics are made of; a stamp alone where the scene says all."""
         scene, last_ns = self._scene, max((message.stamp_ns for message in messages.values()), default=0)
-        if scene.picture is not self._placed[0] or scene.map is not self._placed[1]:
+        if self._is_new("frames", scene.picture, scene.map):
             yield "frames", last_ns, last_ns
-            if scene.picture is not None and scene.picture is not self._placed[0]:
-                yield "picture", last_ns, scene.picture
-            if scene.map is not None and scene.map is not self._placed[1]:
-                yield "map", last_ns, scene.map
-            self._placed = scene.picture, scene.map
+        for name, picture in (("picture", scene.picture), ("map", scene.map)):
+            if picture is not None and self._is_new(name, picture):
+                yield name, last_ns, picture
         robot = messages.get("estimate") or messages.get("track")
         if isinstance(robot, (Estimate, Track)) and abs(robot.stamp_ns - self._robot_ns) >= _ROBOT_EVERY_NS:
             self._robot_ns = robot.stamp_ns
             yield "robot", robot.stamp_ns, robot
-            if scene.picture is not None and drawings.is_finite(robot.position_um):
+            if scene.picture is not None and np.isfinite(robot.position_um).all():
                 yield "robot on picture", robot.stamp_ns, robot
         if messages.get("route") is scene.route and scene.route is not None:
             yield "route", scene.route.stamp_ns, scene.route
         goal = None if scene.goal_um is None else tuple(scene.goal_um.tolist())
-        if goal != self._goal:
-            self._goal = goal
+        if self._is_new("goal", goal):
             yield "goal", last_ns, last_ns
-        marked = (scene.route, goal, scene.picture)
-        if scene.picture is not None and marked != self._marked and (scene.route, goal) != (None, None):
-            self._marked = marked
+        there = scene.picture is not None and (scene.route, goal) != (None, None)
+        if there and self._is_new("marks", scene.route, goal, scene.picture):
             yield "marks", last_ns, last_ns
         if scene.route is not None and ("route" in messages or scene.field in messages.values()):
             yield "route on map", last_ns, scene.route
@@ -107,6 +101,11 @@ class ViewerTopics:
             field = messages.get(name)
             if isinstance(field, FlowField) and drawable(field):
                 yield name, field.stamp_ns, field
+
+    def _is_new(self, name: str, *made_of: object) -> bool:
+        """True if a drawing was last made of something else; then it is noted as made of this."""
+        before, self._drawn[name] = self._drawn.get(name), made_of
+        return made_of != before
 
 
 _FRAMES, _CAMERA, _POSE, _POSES, _POINTS, _MARKS, _IMAGE, _GRID = map(

@@ -53,6 +53,11 @@ class Entry(NamedTuple):
     event: str = ""
     start_unix_ns: int | None = None
 
+    def without_image(self) -> Entry:
+        """All of it but its image, which is counted as left out."""
+        others = {name: message for name, message in self.messages.items() if name != "frame"}
+        return self._replace(messages=others, dropped=self.dropped + 1)
+
 
 class End(NamedTuple):
     """The end of a run.
@@ -122,7 +127,8 @@ class WriteQueue:
         self._changed = threading.Condition()
         self._abandoned = False
         self.end: End | None = None
-        self.given_up = 0  # images that were removed at the end
+        self._dropping = False
+        self.given_up = 0  # images that were left out at the end
         self._flushed_ns = -1
         self.flush_wanted = False  # a thread waits for a flush
 
@@ -170,7 +176,11 @@ class WriteQueue:
         with self._changed:
             self._changed.wait_for(lambda: self._state or self._images or self.end or self.flush_wanted, timeout_s)
             queue = self._state or self._images
-            return queue.popleft() if queue else None
+            entry = queue.popleft() if queue else None
+        if entry is None or not self._dropping or "frame" not in entry.messages:
+            return entry
+        self.given_up += 1
+        return entry.without_image()
 
     @property
     def images_wait(self) -> bool:
@@ -178,17 +188,8 @@ class WriteQueue:
         return bool(self._images)
 
     def drop_images(self) -> None:
-        """Remove the images that wait, and count them."""
-        with self._changed:
-            dropped = len(self._images)
-            for place, image in enumerate(self._images):
-                self._images[place] = image._replace(messages={}, dropped=1)
-            for place, entry in enumerate(self._state):  # a writer that blocks puts images with the rest
-                if "frame" in entry.messages:
-                    others = {name: message for name, message in entry.messages.items() if name != "frame"}
-                    self._state[place] = entry._replace(messages=others, dropped=entry.dropped + 1)
-                    dropped += 1
-            self.given_up += dropped
+        """Pass over the images that wait, and count them."""
+        self._dropping = True
 
     def release(self, entry: Entry) -> None:
         """Free the bytes of an entry that the recorder has handled."""

@@ -25,13 +25,13 @@ from flowrec.core import (
     nanoseconds,
     shape_error,
 )
-from flowrec.store.channels import FRAME_PATH, codec_of_extra
+from flowrec.store.channels import FRAME_PATH, message_codec
 from flowrec.store.codec import codec_of, encode_record
-from flowrec.store.recorder_process import RecorderProcess
-from flowrec.store.recording import RecorderThread, RecordingPlan
+from flowrec.store.recorder_process import RecorderProcess, RecorderThread
 from flowrec.store.ring_buffer import SnapshotTrigger
 from flowrec.store.roi import WindowSelector
 from flowrec.store.run_files import refuse_if_taken, run_files
+from flowrec.store.segments import RecordingPlan
 from flowrec.store.session_file import Snapshot, WriterOptions
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.viewer_scene import ChipCamera
@@ -92,7 +92,7 @@ class SessionWriter:
         self._last_ns = -1
         self._closed = self._told = False
         self._extra = NO_EXTRA
-        self._extra_codecs = {topic.path: codec_of_extra(topic) for topic in options.topics.extra}
+        self._extra_codecs = {topic.path: message_codec(topic.type, path=topic.path) for topic in options.topics.extra}
         self._start_unix_ns = header.start_unix_ns
         self._trigger = SnapshotTrigger(options.files) if isinstance(options.files, Snapshot) else None
         self._left_out = [topic.field for topic in options.topics.topics if topic.path in options.left_out_topics]

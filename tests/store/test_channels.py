@@ -21,8 +21,8 @@ def test_what_is_left_out_is_not_in_the_file_and_the_rest_is_unchanged(tmp_path)
     gone = everything.counts.keys() - less.counts.keys()
     assert gone == everything.counts.keys() & {"frame", "truth", "true_field"} and "frame" in gone
     assert {name: everything.counts[name] for name in less.counts} == less.counts
-    channels = {channel.id: channel.topic for channel in less._file(0).channels.values()}
-    counts = less._file(0).statistics.channel_message_counts
+    channels = {channel.id: channel.topic for channel in less.file(0).channels.values()}
+    counts = less.file(0).statistics.channel_message_counts
     assert not VIEWED & {channels[number] for number in counts}
 
 

@@ -23,11 +23,12 @@ from flowrec.stages.config import load_config
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.parts import Parts
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
-from flowrec.store.segments import Parts
-from flowrec.store.session_file import Split, WriterOptions
+from flowrec.store.segments import RecordingPlan
+from flowrec.store.session_file import WriterOptions
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
 from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S
@@ -219,7 +220,7 @@ def test_a_power_cut_costs_no_more_than_what_was_not_yet_kept_by_the_disk(tmp_pa
 
     def noted(self):
         # What the disk is sure to have afterwards.
-        stamp_ns, size = writer._recorder.recorder.flushed_ns, os.fstat(self._file.fileno()).st_size
+        stamp_ns, size = writer._recorder.run.flushed_ns, os.fstat(self._file.fileno()).st_size
         sync(self)
         kept.append((stamp_ns, size))
 
@@ -368,7 +369,7 @@ def test_the_operating_system_has_all_state_but_the_last_flush_s_of_stamps(tmp_p
             writer.write(tick)
             while writer.queue_bytes:
                 time.sleep(1e-4)
-            assert (writer._recorder.recorder.flushed_ns or ticks[0].stamp_ns) >= tick.stamp_ns - NS_PER_S // 2
+            assert (writer._recorder.run.flushed_ns or ticks[0].stamp_ns) >= tick.stamp_ns - NS_PER_S // 2
 
 
 def test_with_the_shipped_settings_a_power_cut_costs_a_second_on_the_slowest_disk_that_the_promise_allows(
@@ -383,7 +384,7 @@ def test_with_the_shipped_settings_a_power_cut_costs_a_second_on_the_slowest_dis
         sync(file)
 
     options = WriterOptions(flush_s=recording.flush_s, sync_s=recording.sync_s, clock=lambda: now_s[0])
-    parts = Parts(tmp_path / "s.mcap", HEADER, options, None, Split(), "run")
+    parts = Parts(RecordingPlan(tmp_path / "s.mcap", HEADER, options, None, "run", {}), print)
     monkeypatch.setattr(McapWriter, "sync", slow)
     file = parts.open[-1].file
     kept_ns, asked, lost_s, syncs = TICKS_BEGIN_NS, None, [], 0

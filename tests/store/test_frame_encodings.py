@@ -127,7 +127,7 @@ def test_after_damage_the_next_chunk_that_is_not_compressed_is_found(name, tmp_p
     path = record(tmp_path / "s.mcap", name, flush_s=0.0)
     content = bytearray(path.read_bytes())
     with SessionReader(path) as reader:
-        frames = [c for c in reader._file(0).chunks if c.compression == ""]
+        frames = [c for c in reader.file(0).chunks if c.compression == ""]
     content[frames[1].chunk_start_offset + 5] ^= 0xFF  # its length makes no sense
     path.write_bytes(content)
     with SessionReader(recover(path).path) as reader:

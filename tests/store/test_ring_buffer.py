@@ -16,11 +16,12 @@ from flowrec.core.errors import SessionError
 from flowrec.core.messages import Event, Frame, OperatorEvent
 from flowrec.core.units import NS_PER_S
 from flowrec.store.channels import FRAME_PATH
+from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.run_files import snapshot_path
-from flowrec.store.session_file import Snapshot, WriterOptions
+from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
 from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
@@ -207,7 +208,7 @@ def test_a_place_that_may_not_be_written_or_is_taken_is_told_before_the_run(tmp_
 
 KILLED = """
 import sys, time
-from flowrec.store.session_file import Snapshot, WriterOptions
+from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
 from flowrec.store.writer import SessionWriter
 from tests.store.test_ring_buffer import HEADER, with_events
 writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=0.1, files=Snapshot(2.0, 8.0)))
@@ -245,3 +246,22 @@ def test_a_disk_that_refuses_a_snapshot_is_an_error_of_the_run(tmp_path, monkeyp
     monkeypatch.setattr(McapWriter, method, refuse)
     with pytest.raises(SessionError, match="the disk is full; free some space, then `flowrec recover"):
         record(tmp_path / "x.mcap", with_events((300, ("mark", ""))), sync_s=0.0)
+
+
+def test_nothing_is_written_behind_what_the_disk_has_refused(tmp_path, monkeypatch):
+    written = []
+
+    def refuse_first(_file, chunks):
+        written.append(chunks)
+        if len(written) == 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(McapWriter, "add_chunks", refuse_first)
+    file, builder = SessionFile(tmp_path / "x.mcap", HEADER, WriterOptions(), limit_bytes=1 << 20), ChunkBuilder()
+    for number in range(3):
+        builder.add(1, number, number, number, (b"message",))
+        file.put([builder.seal()])
+    file.close()
+    assert len(written) == 1
+    with pytest.raises(SessionError, match="the disk is full"):
+        file.check()

@@ -23,11 +23,12 @@ from flowrec.core.units import NS_PER_S, seconds
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.parts import Parts
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.run_files import part_path, run_files
 from flowrec.store.scan import scan
-from flowrec.store.segments import Parts
+from flowrec.store.segments import RecordingPlan
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, ticks_of
@@ -138,8 +139,8 @@ def test_a_part_whose_beginning_is_larger_than_a_part_still_gets_as_much_again(t
 
 
 def test_a_part_counts_the_images_that_still_wait_for_it_until_they_have_come(tmp_path):
-    split = Split(megabytes=0.2)
-    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, frames="raw"), None, split, "run")
+    options = WriterOptions(files=Split(megabytes=0.2), frames="raw")
+    parts = Parts(RecordingPlan(tmp_path / "x.mcap", HEADER, options, None, "run", {}), print)
     first = parts.open[0]
     ticks = list(ticks_of(12, shape=(200, 200)))
     image = {tick.stamp_ns: entry_of(tick.stamp_ns, tick.frame, nbytes=40_000, late=True) for tick in ticks}
@@ -306,8 +307,8 @@ def test_however_slow_the_disk_ends_a_part_a_kill_leaves_no_hole_before_the_next
 
 
 def test_the_operating_system_has_a_part_before_the_next_one_begins_though_images_of_it_wait(tmp_path):
-    split = Split(seconds=0.3)
-    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, flush_s=100.0), None, split, "run")
+    options = WriterOptions(files=Split(seconds=0.3), flush_s=100.0)
+    parts = Parts(RecordingPlan(tmp_path / "x.mcap", HEADER, options, None, "run", {}), print)
     for tick in TICKS[:30]:
         parts.add(entry_of(tick.stamp_ns, tick.track, nbytes=500, ticks=1, image_bytes=64))
     first, second = parts.open

@@ -106,8 +106,8 @@ def test_the_state_between_two_ticks_is_that_of_the_earlier_one(path):
 
 def test_poses_are_read_without_touching_a_frame(path, monkeypatch):
     reader = SessionReader(path)
-    source = reader._file(0).source
-    frames = {c.chunk_start_offset for c in reader._file(0).chunks if 1 in c.message_index_offsets}
+    source = reader.file(0).source
+    frames = {c.chunk_start_offset for c in reader.file(0).chunks if 1 in c.message_index_offsets}
     read, pread = [], source.read
     monkeypatch.setattr(type(source), "read", lambda _, at, length: (read.append(at), pread(at, length))[1])
     ticks = list(reader.ticks(with_frames=False))

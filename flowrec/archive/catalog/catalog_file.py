@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from flowrec.archive.catalog.format import EVENTS, KEY, NAME, PARQUET, PLACE, SIGNATURE, SWEEP, About
 from flowrec.core import FlowrecError, Output, OutputError, UsageError, open_new, refuse_irregular, replacing, unit_of
@@ -34,33 +34,32 @@ _EVENT = pa.list_(pa.struct([("time_s", pa.float64()), ("action", pa.string()), 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Contents of a catalog file: its sessions, without the columns that are joined to them anew, and its metadata."""
+    """Contents of a catalog file: its sessions, without the columns that are joined to them anew, and its metadata.
+
+    `remark` : that the file can not be used.
+    """
 
     sessions: pa.Table
     about: About | None = None
-
-    @classmethod
-    def nothing(cls) -> Self:
-        """An empty catalog, for a file that does not exist yet."""
-        return cls(table_of([]))
+    remark: str = ""
 
 
-def read(path: Path, remark: str = "is made anew") -> tuple[Known, str]:
-    """Read the contents of an earlier catalog, and a remark if it can not be used; both empty if there is none.
+def read(path: Path) -> Known:
+    """Read the contents of an earlier catalog: no session where there is none, or it can not be used.
 
     Raises
     ------
     OutputError : the file is something else, which is never replaced.
     """
     if not os.path.lexists(path):
-        return Known.nothing(), ""
+        return Known(table_of([]))
     refuse_irregular(path)
     try:
         table = pq.read_table(path, partitioning=None)
     except (OSError, pa.ArrowException) as error:
         reason = str(error).partition("\n")[0]
         if path.name == NAME:
-            return Known.nothing(), f"{path}: is damaged ({reason}), and {remark}"
+            return Known(table_of([]), remark=f"{path}: is damaged ({reason}), and is made anew")
         raise OutputError(
             f"{path}: can not be read as Parquet ({reason}), and stays; remove it, or choose another name"
         ) from error
@@ -69,8 +68,8 @@ def read(path: Path, remark: str = "is made anew") -> tuple[Known, str]:
         raise OutputError(f"{path}: was not written by flowrec catalog, and stays; choose another name")
     about = About.of(ours.decode(errors="replace"))
     if about is None or not {"path", PLACE, SIGNATURE} <= set(table.column_names):
-        return Known.nothing(), f"{path}: is a catalog of another version of flowrec, and {remark}"
-    return Known(table.drop_columns([SWEEP, VERDICT]), about), ""
+        return Known(table_of([]), remark=f"{path}: is a catalog of another version of flowrec, and is made anew")
+    return Known(table.drop_columns([SWEEP, VERDICT]), about)
 
 
 @contextlib.contextmanager

@@ -98,8 +98,8 @@ def refresh(
         path /= NAME
     base = path.parent
     with catalog_file.lock_catalog(path):
-        known, remark = catalog_file.read(path)
-        remarks = [remark] if remark else []
+        known = catalog_file.read(path)
+        remarks = [known.remark] if known.remark else []
         if not given and known.about is not None:
             given = [path_of(text, base) for text in known.about.places]
         given = given or [base if out is None else Path()]
@@ -107,8 +107,8 @@ def refresh(
         if not found:
             raise _empty_error(given, len(known.sessions))
         named = {path_text(each.path, base): each for each in found}
-        places_before = map(os.fsdecode, known.sessions[PLACE].to_pylist())
-        before = dict(zip(places_before, known.sessions[SIGNATURE].to_pylist(), strict=True))
+        places_before, signatures = (known.sessions[name].to_pylist() for name in (PLACE, SIGNATURE))
+        before = dict(zip(map(os.fsdecode, places_before), signatures, strict=True))
         due = {text: each for text, each in named.items() if before.get(text) != each.signature}
         rows, stop_status = _read(due, progress)
         left = len(due) - len(rows)

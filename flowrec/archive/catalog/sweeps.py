@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flowrec.archive.sweep.ranking import RANKED_BY, settings_text
-from flowrec.archive.sweep.results import COLUMNS, array_of, is_sweep, rows_of
+from flowrec.archive.sweep.results import COLUMNS, array_of, is_sweep, settings_in
 from flowrec.core import FlowrecError, SessionError
 from flowrec.store import open_bytes
 
@@ -36,13 +36,13 @@ def sweep_rows(tables: Iterable[Path], named: Callable[[Path], str], remark: Cal
     rows: dict[str, dict[str, Any]] = {}
     for path in tables:
         try:
-            table = _read(path)
-            found = rows_of(table) if is_sweep(table.schema) else []
+            found = _read(path)
         except (FlowrecError, pa.ArrowException, OSError, ValueError, KeyError) as error:
-            remark(f"{path}: can not be read as Parquet, and is passed over ({_first_line(error)})")
+            reason = str(error).partition("\n")[0]
+            remark(f"{path}: can not be read as Parquet, and is passed over ({reason})")
             continue
         for row in found:
-            rows[row["key"]] = _flat(row) | {"table": named(path)}
+            rows[row["key"]] = row | {"table": named(path)}
     _rank(rows.values())
     names = dict.fromkeys(("settings", "place", "table", *COLUMNS, *(name for row in rows.values() for name in row)))
     columns = {name: array_of([row.get(name) for row in rows.values()], _EMPTY.get(name)) for name in names}
@@ -64,28 +64,23 @@ def lists_of(contents: Sequence[str | None], rows: pa.Table) -> tuple[pa.ListArr
     for content in contents:
         order += by_content.get(content or "", ())
         offsets.append(len(order))
-    taken = rows.take(pa.array(order, pa.int64())).combine_chunks()
-    arrays = [_one(taken[name]) for name in taken.column_names]
-    structures = pa.StructArray.from_arrays(arrays, names=taken.column_names)
+    structures = rows.take(pa.array(order, pa.int64())).to_struct_array().combine_chunks()
     lists = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), structures)
     return lists, [verdicts.get(content or "") for content in contents]
 
 
-def _read(path: Path) -> pa.Table:
-    source = open_bytes(path)
-    with contextlib.closing(source):
+def _read(path: Path) -> list[dict[str, Any]]:
+    """The rows of the table of a sweep by column, with their settings as one text; none of another table."""
+    with contextlib.closing(open_bytes(path)) as source:
         if source.size > _LIMIT_BYTES:
             raise SessionError(f"{path}: is larger than the table of a sweep")
         file = pq.ParquetFile(io.BytesIO(source.read(0, source.size)))
-        return file.read() if is_sweep(file.schema_arrow) else file.schema_arrow.empty_table()
-
-
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of a sweep with a member a setting and two a figure, as the columns of its table."""
-    flat = {name: row[name] for name in COLUMNS} | dict(row["settings"])
-    for name, (recorded, replayed) in row["figures"].items():
-        flat |= {f"recorded_{name}": recorded, f"replayed_{name}": replayed}
-    return flat | {"settings": settings_text(row["settings"], refly=bool(row.get("refly")))}
+        if not is_sweep(file.schema_arrow):
+            return []
+        table = file.read()
+    rows = table.select([*COLUMNS, *(name for name in table.column_names if name not in COLUMNS)]).to_pylist()
+    settings = settings_in(table)
+    return [row | {"settings": settings_text(row | {"settings": settings(row)})} for row in rows]
 
 
 def _rank(rows: Iterable[dict[str, Any]]) -> None:
@@ -101,11 +96,3 @@ def _rank(rows: Iterable[dict[str, Any]]) -> None:
                 for place, row in enumerate(ranked, 1):
                     row["place"] = place
                 break
-
-
-def _one(column: pa.ChunkedArray) -> pa.Array:
-    return pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,9 +79,7 @@ class Ranking:
         """
         by_settings: dict[str, dict[str, Row]] = {}
         for row in rows:
-            by_settings.setdefault(settings_text(row["settings"], refly=bool(row.get("refly"))), {})[row["content"]] = (
-                row
-            )
+            by_settings.setdefault(settings_text(row), {})[row["content"]] = row
         contents = {row["content"] for row in rows}
         figure = figure if figure is not None else _first_figure(rows)
         values = {
@@ -145,9 +143,10 @@ class Ranking:
         }
 
 
-def settings_text(settings: Mapping[str, str], *, refly: bool) -> str:
+def settings_text(row: Row) -> str:
     """The settings of a replay in a line."""
-    return ", ".join(f"{key}={value}" for key, value in settings.items()) + (" (reflown)" if refly else "") or "none"
+    settings = ", ".join(f"{key}={value}" for key, value in row["settings"].items())
+    return settings + (" (reflown)" if row.get("refly") else "") or "none"
 
 
 def _first_figure(rows: Sequence[Row]) -> str:

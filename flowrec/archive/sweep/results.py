@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -187,7 +187,13 @@ def read_rows(path: Path) -> list[Row]:
         raise SessionError(f"{path}: can not be read as Parquet ({reason}); flowrec sweep writes such files") from error
     if not is_sweep(table.schema):
         raise OutputError(f"{path}: was not written by flowrec sweep, and stays; choose another name")
-    return rows_of(table)
+    settings, names = settings_in(table), json.loads(table.schema.metadata[_OURS])["figures"]
+    rows = []
+    for columns in table.to_pylist():
+        figures = {name: [columns[side + name] for side in _SIDES] for name in names}
+        stated = {name: pair for name, pair in figures.items() if pair != [None, None]}
+        rows.append({name: columns[name] for name in COLUMNS} | {"settings": settings(columns), "figures": stated})
+    return rows
 
 
 def is_sweep(schema: pa.Schema) -> bool:
@@ -195,17 +201,10 @@ def is_sweep(schema: pa.Schema) -> bool:
     return _OURS in (schema.metadata or {})
 
 
-def rows_of(table: pa.Table) -> list[Row]:
-    """The rows of the table of a sweep; KeyError or ValueError if it was changed since."""
-    names = json.loads(table.schema.metadata[_OURS])
-    rows = []
-    for columns in table.to_pylist():
-        row = {name: columns[name] for name in COLUMNS}
-        row["settings"] = {name: columns[name] for name in names["settings"] if columns[name] is not None}
-        figures = {name: [columns[side + name] for side in _SIDES] for name in names["figures"]}
-        row["figures"] = {name: pair for name, pair in figures.items() if pair != [None, None]}
-        rows.append(row)
-    return rows
+def settings_in(table: pa.Table) -> Callable[[Row], dict[str, str]]:
+    """The settings among the columns of a row; KeyError or ValueError if the table was changed since."""
+    names = json.loads(table.schema.metadata[_OURS])["settings"]
+    return lambda columns: {name: columns[name] for name in names if columns[name] is not None}
 
 
 def _table(rows: Sequence[Row]) -> pa.Table:
@@ -213,16 +212,14 @@ def _table(rows: Sequence[Row]) -> pa.Table:
     verdicts = {row["content"]: row for row in rows if row.get("verdict")}
     settings = list(dict.fromkeys(name for row in rows for name in row["settings"]))
     figures = list(dict.fromkeys(name for row in rows for name in row.get("figures", {})))
-    columns: dict[str, list[Any]] = {name: [row[name] for row in rows] for name in _FIRST}
-    columns |= {name: [row["settings"].get(name) for row in rows] for name in settings}
-    for name in figures:
-        for number, side in enumerate(_SIDES):
-            columns[side + name] = [row.get("figures", {}).get(name, (None, None))[number] for row in rows]
-    for name in COLUMNS:
-        judged = name in ("verdict", "findings")
-        columns[name] = [(verdicts.get(row["content"], row) if judged else row).get(name) for row in rows]
-    first = {name: columns[name] for name in _FIRST}
-    arrays = {name: array_of(values) for name, values in (first | columns).items()}
+    flat = []
+    for row in rows:
+        pairs = row.get("figures", {}).items()
+        sides = {side + name: value for name, pair in pairs for side, value in zip(_SIDES, pair, strict=True)}
+        judged = {name: verdicts.get(row["content"], row).get(name) for name in ("verdict", "findings")}
+        flat.append({**row, **row["settings"], **sides, **judged})
+    names = (*_FIRST, *settings, *(side + name for name in figures for side in _SIDES), *COLUMNS)
+    arrays = {name: array_of([row.get(name) for row in flat]) for name in dict.fromkeys(names)}
     fields = [
         pa.field(name, array.type, metadata={"unit": unit_of(name), "meaning": COLUMNS.get(name, "")})
         for name, array in arrays.items()

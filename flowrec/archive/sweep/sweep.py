@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.archive.sweep.cluster import rows_of, workers_of
-from flowrec.archive.sweep.ranking import Ranking
+from flowrec.archive.sweep.ranking import Ranking, settings_text
 from flowrec.archive.sweep.results import COLUMNS, Results, read_rows
 from flowrec.archive.sweep.tasks import Sessions, Settings, Task, change_of, combinations, session_files
 from flowrec.core import Coverage, progress, say
@@ -60,9 +60,7 @@ class Swept:
         failed = self.failed
         passed = f", {self.tasks - self.computed} were done before" if self.computed < self.tasks else ""
         lines = [f"{self.computed} replays done{passed}; {self.covered.amount} have a result -> {self.path}"]
-        for row in failed[:_NAMED]:
-            settings = ", ".join(f"{key}={value}" for key, value in row["settings"].items())
-            lines.append(f"failed: {row['session']} with {settings}: {row['error']}")
+        lines += [f"failed: {row['session']} with {settings_text(row)}: {row['error']}" for row in failed[:_NAMED]]
         if failed:
             more = f"{len(failed) - _NAMED} more have failed; " if len(failed) > _NAMED else ""
             lines.append(f"{more}--retry does what has failed again")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flowrec.archive.sweep.ranking import Ranking
+from flowrec.archive.sweep.ranking import Ranking, settings_text
 from flowrec.archive.sweep.replay_process import Row
 from flowrec.archive.sweep.results import read_rows
 from flowrec.core import Output, UsageError, name_of, say, text_of_figure
@@ -59,7 +59,7 @@ def _page(name: str, rows: Sequence[Row], ranking: Ranking) -> SweepPage:
     columns, cells = ranking.cells()
     tables = []
     if failed:
-        lines = [(row["session"], _settings(row), row["error"]) for row in failed[:_LISTED]]
+        lines = [(row["session"], settings_text(row), row["error"]) for row in failed[:_LISTED]]
         note = f"The first {_LISTED} of {len(failed)}." if len(failed) > _LISTED else ""
         tables.append(ReportTable("Replays that have failed", lines, ("session", "settings", "error"), note))
     if verdicts:
@@ -76,10 +76,6 @@ def _page(name: str, rows: Sequence[Row], ranking: Ranking) -> SweepPage:
         ranking=ReportTable("Ranking", cells, columns, narrow_columns=3),
         tables=tables,
     )
-
-
-def _settings(row: Row) -> str:
-    return ", ".join(f"{key}={value}" for key, value in row["settings"].items())
 
 
 def _figure(ranking: Ranking) -> Any:

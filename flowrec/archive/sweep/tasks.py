@@ -18,13 +18,11 @@ from flowrec.store import (
     Session,
     SessionMetadata,
     UrlPath,
-    part_number,
     run_files,
-    run_path,
     session_path,
     session_sha256,
 )
-from flowrec.verbs import read_each
+from flowrec.verbs import read_each, runs_of
 
 if TYPE_CHECKING:
     from flowrec.verbs import Change
@@ -135,24 +133,18 @@ def session_files(places: Sequence[str]) -> list[Path]:
             files = files_at(at, (SESSION_SUFFIX,))
             if not files:
                 raise UsageError(f"{at}: no session (.mcap) is there")
-            found |= dict.fromkeys(_runs(files))
+            found |= dict.fromkeys(runs_of(files))
             continue
         folder = Path(place).is_dir()
         whole = glob.escape(place) + f"/*{SESSION_SUFFIX}" if folder else place
         names = [place] if Path(place).is_file() else sorted(glob.glob(whole, recursive=True))  # noqa: PTH207 - text
         files = [Path(name).absolute() for name in names if name.endswith(SESSION_SUFFIX)]
-        runs = _runs(files)
+        runs = runs_of(files)
         run = Path(place).absolute()
         if not runs and not (run.name.endswith(SESSION_SUFFIX) and run_files(run)):  # X.mcap may be a run in parts
             raise UsageError(f"{place}: no session (.mcap) is there; name files, folders or patterns as 'runs/*.mcap'")
         found |= dict.fromkeys(runs or [run])
     return list(found)
-
-
-def _runs(files: Sequence[Path]) -> list[Path]:
-    """The files, where parts stand for their run unless a file has its name."""
-    named = set(files)
-    return [run_path(file) if part_number(file) and run_path(file) not in named else file for file in files]
 
 
 def content_of(session: Session) -> str:

@@ -288,8 +288,8 @@ def test_a_catalog_is_the_former_or_the_new_one_after_a_power_cut(
     written = [0]
 
     def check(place: Path) -> None:
-        known, remark = catalog_file.read(place / "flowrec-catalog.parquet")
-        assert not remark and len(known.sessions) in (written[-1], written[-1] + 1)
+        known = catalog_file.read(place / "flowrec-catalog.parquet")
+        assert not known.remark and len(known.sessions) in (written[-1], written[-1] + 1)
 
     with recorded(monkeypatch, tmp_path, check) as disk:
         path = disk.root / "flowrec-catalog.parquet"
