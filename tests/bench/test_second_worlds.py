@@ -88,7 +88,7 @@ def test_a_survey_is_refined_and_scored_like_a_flight() -> None:
     ("world", "seed", "doubted"),
     [
         pytest.param("growing_bubble", 3, 1, marks=pytest.mark.slow("refines a survey of a network")),
-        ("late_clock", 2, 1),
+        pytest.param("late_clock", 2, 1, marks=pytest.mark.slow("refines a survey of a network")),
         ("roller", 2, 0),
     ],
 )

@@ -51,7 +51,8 @@ def test_a_plain_movie_has_nearly_the_same_images_and_stamps_to_half_a_microseco
             assert abs(read.time_ns - frame.stamp_ns) <= 500
 
 
-@pytest.mark.parametrize("kind", [pytest.param("mp4_plain", marks=pytest.mark.slow("reads a movie")), "tiff"])
+@pytest.mark.slow("exports a whole session")
+@pytest.mark.parametrize("kind", ["mp4_plain", "tiff"])
 def test_an_import_need_not_be_told_scale_robot_chip_and_clock(kind, exported, tmp_path):
     session = flowrec.open(GOLDEN)
     asked = asked_import(exported[kind], coils=exported["csv"] / "applied.csv")

@@ -44,6 +44,7 @@ def test_a_turned_camera_costs_nothing_where_the_settings_say_so(name, tmp_path)
     assert track_um < 4.0  # a fifth of a pixel
 
 
+@pytest.mark.slow("flies a mission with a turned camera")
 def test_a_turned_camera_of_which_the_settings_know_nothing_spoils_track_and_flow(tmp_path):
     error, track_um = flown(tmp_path, "simulated.angle_deg=2")
     assert error > 0.04

@@ -54,6 +54,7 @@ def test_mission_and_controller_place_the_robot_by_the_registration_that_was_fou
     assert moved.demand.velocity_um_s[1] < plain.demand.velocity_um_s[1]  # back to the route
 
 
+@pytest.mark.slow("flies two missions")
 def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no_observation(navigation):
     pipeline, ticks = navigation
 

@@ -84,6 +84,7 @@ def test_no_tick_is_seen_before_its_image_has_come(tmp_path):
     assert len(watcher.ticks) == 60
 
 
+@pytest.mark.slow("records a run in a process of its own")
 def test_a_run_in_parts_is_followed_from_part_to_part(tmp_path):
     path = tmp_path / "x.mcap"
     writer, watcher = begun(path, replace(OPTIONS, files=Split(seconds=0.3)))

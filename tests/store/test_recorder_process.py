@@ -73,7 +73,7 @@ def test_parts_snapshots_and_declared_topics_pass_through_a_process(tmp_path):
     assert len(read) == len(ticks) and all(same_extra(one, other) for one, other in zip(ticks, read, strict=True))
 
 
-@pytest.mark.parametrize("block", [True, False])
+@pytest.mark.parametrize("block", [True, pytest.param(False, marks=pytest.mark.slow("the same without waiting"))])
 def test_a_part_begins_with_the_last_image_before_it_whatever_its_memory_is_used_for(tmp_path, monkeypatch, block):
     monkeypatch.setattr(shared_queue, "_STATE_BYTES" if block else "_IMAGE_BYTES", 50_000)
     monkeypatch.setattr(shared_queue, "_MARGIN_BYTES", 1000)
@@ -175,7 +175,12 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+MORE = pytest.mark.slow("kills a run in another way")
+
+
+@pytest.mark.parametrize(
+    "kind", ["live", "parts", *(pytest.param(kind, marks=MORE) for kind in KINDS if kind not in ("live", "parts"))]
+)
 def test_of_a_run_that_is_killed_every_tick_that_it_handed_over_is_in_a_complete_session(tmp_path, kind):
     path = tmp_path / "x.mcap"
     run, _ = started(path, *KINDS[kind])
@@ -228,6 +233,7 @@ def test_a_run_that_accepts_losses_goes_on_without_its_recorder_says_so_once_and
         writer.close()
 
 
+@pytest.mark.slow("stops a recorder")
 def test_a_recorder_that_stands_still_costs_no_tick_and_delays_no_write(tmp_path):
     options = WriterOptions(own_process=True, frames="raw", queue_limit_bytes=1 << 20)
     writer = SessionWriter(tmp_path / "x.mcap", HEADER, options)
@@ -281,6 +287,7 @@ def test_a_recorder_that_writes_nothing_for_long_is_told_and_completes_the_file_
         assert file.counts["frame"] == len(TICKS)
 
 
+@pytest.mark.slow("signals two recorders")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_recorder_ends_with_its_run_and_by_no_signal_that_asks_it_to(tmp_path, number):
     with SessionWriter(tmp_path / "x.mcap", HEADER, OWN) as writer:
@@ -310,6 +317,7 @@ def test_a_disk_that_is_full_ends_the_run_with_its_reason_and_what_was_written_i
     assert recover(writer.partial_path).ticks > 10
 
 
+@pytest.mark.slow("gives up the images of two runs")
 @pytest.mark.parametrize("waiting", [60, 20])  # of 60 images; the others are dropped before
 def test_a_run_whose_images_are_given_up_counts_them(tmp_path, waiting):
     limit = round((waiting + 0.5) * TICKS[0].frame.image.nbytes) + (1 << 18 if waiting == 60 else 0)

@@ -93,6 +93,7 @@ def at_the_command_line(words: list[object], monkeypatch: pytest.MonkeyPatch) ->
     return int(ended.value.code or 0)
 
 
+@pytest.mark.slow("aligns a whole movie by its motion")
 def test_calibrate_motion_at_the_command_line_takes_another_log_on_another_clock(
     imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -96,7 +96,10 @@ def test_the_same_again_sends_nothing_and_other_content_is_never_replaced(server
         assert len(refused.files) == 1 and content(server, "large.mcap") == changed
 
 
-@pytest.mark.parametrize(("parts", "same"), [(LARGE_PARTS, True), (LARGE_PARTS, False), (1, False)])
+@pytest.mark.parametrize(
+    ("parts", "same"),
+    [pytest.param(LARGE_PARTS, True, marks=pytest.mark.slow("pushes a large file")), (LARGE_PARTS, False), (1, False)],
+)
 def test_an_object_that_comes_during_the_push_is_compared_and_not_replaced(
     server: S3Server, large: Path, parts: int, same: bool
 ) -> None:
@@ -173,6 +176,7 @@ def test_what_another_upload_has_left_is_not_taken_for_ours(server: S3Server, la
     assert [each["UploadId"] for each in client.list_multipart_uploads(Bucket=BUCKET)["Uploads"]] == [foreign]
 
 
+@pytest.mark.slow("waits for a server in trouble")
 def test_a_server_in_trouble_is_asked_again_and_that_is_said(server: S3Server, large: Path) -> None:
     failing = iter([500, 503, None, None, 500])
     server.fault = lambda method, _: next(failing, None) if method in ("PUT", "POST") else None
@@ -260,6 +264,7 @@ def test_what_a_store_does_not_offer_is_asked_for_once_and_called_so(server: S3S
     assert [method for method, _ in server.requests].count("PUT") == 1
 
 
+@pytest.mark.slow("pushes a file in parts")
 def test_a_part_that_arrives_otherwise_is_never_called_pushed(
     server: S3Server, large: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

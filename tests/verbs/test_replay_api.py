@@ -78,6 +78,7 @@ def test_replays_in_threads_and_in_a_notebook_make_the_bytes_that_the_verb_makes
     )
 
 
+@pytest.mark.slow("replays a mission")
 def test_a_replay_has_tables_and_its_temporary_file_goes_with_it() -> None:
     done = flowrec.replay(GOLDEN, sets=CHANGE)
     path = done.result.path

@@ -15,6 +15,7 @@ from flowrec.store.writer import SessionWriter
 from flowrec.verbs.check import check
 from flowrec.verbs.record import record
 from flowrec.verbs.sign import sign
+from tests.short_missions import SMALL
 from tests.store.made_up import HEADER, ticks_of
 
 pytestmark = pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="OpenSSH is not installed")
@@ -107,5 +108,5 @@ def test_a_signature_is_not_replaced_and_a_wrong_key_or_list_is_refused(
 
 
 def test_a_run_is_signed_when_it_is_complete(tmp_path: Path, keys: tuple[Path, Path]) -> None:
-    record(out=tmp_path / "r.mcap", duration_s=0.5, sign=keys[0])
+    record(out=tmp_path / "r.mcap", duration_s=0.5, sets=SMALL, sign=keys[0])
     assert check(tmp_path / "r.mcap", signers=signers_of(*keys)).integrity == "intact, signed by ada@lab"

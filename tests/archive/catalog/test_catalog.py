@@ -404,6 +404,7 @@ def test_the_connection_itself_can_do_none_of_it(catalogued: Path, statement: st
     assert not (catalogued / "x.csv").exists() and not (catalogued / "x.db").exists()
 
 
+@pytest.mark.slow("waits for a condition that does not end")
 def test_ctrl_c_ends_a_condition_that_does_not_end(catalogued: Path) -> None:
     endless = "(select count(*) from range(1000000000) a, range(1000000000) b where a.range + b.range = seed) > 0"
     code = (

@@ -58,7 +58,11 @@ def test_mirrored_left_to_right_reverses_x_alone():
     np.testing.assert_allclose(right.matrix @ (1.0, 0.0), (0.0, 1.0), atol=1e-12)  # y is down
 
 
-@pytest.mark.parametrize("orientation", [AS_STATED, ORIENTATIONS[1], ORIENTATIONS[6]], ids=lambda each: each.name)
+@pytest.mark.parametrize(
+    "orientation",
+    [AS_STATED, pytest.param(ORIENTATIONS[1], marks=pytest.mark.slow("another orientation")), ORIENTATIONS[6]],
+    ids=lambda each: each.name,
+)
 def test_a_picture_in_another_orientation_is_contradicted_with_the_settings_that_make_it_right(junction, orientation):
     said = orientation_by_image(
         pictured(junction, orientation.about(stated(junction), MIDDLE_PX)), junction, stated(junction)

@@ -24,7 +24,7 @@ def seen(look):
     ("look", "shown"),
     [
         ("dark lines", "dark"),
-        ("ink", "step"),
+        pytest.param("ink", "step", marks=pytest.mark.slow("segments a picture of another look")),
         pytest.param("thin bright lines", "bright", marks=pytest.mark.slow("segments a picture of another look")),
     ],
 )
@@ -50,6 +50,7 @@ def test_a_point_says_which_side_of_the_walls_is_the_channel():
         segment(image, seeds_px=[(400.0, 3.0)])
 
 
+@pytest.mark.slow("segments pictures of other things")
 def test_pictures_without_a_channel_are_refused():
     noise = np.random.default_rng(0).normal(120, 20, SIZE_PX[::-1]).clip(0, 255).astype(np.uint8)
     for image, why in ((noise, "no channel is seen"), (np.full(SIZE_PX[::-1], 200, np.uint8), "is blank")):
@@ -57,6 +58,7 @@ def test_pictures_without_a_channel_are_refused():
             segment(image)
 
 
+@pytest.mark.slow("segments a picture of a thin wall")
 def test_a_wall_that_may_close_a_branch_makes_the_picture_unsure():
     """Dirt across a channel closes it at one threshold and not at another: a flow there would be a guess."""
     image = seen("noisy")

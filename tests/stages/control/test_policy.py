@@ -93,7 +93,7 @@ def ring():
     return chip, field, replace(robot, delay_s=0.04), route, back
 
 
-@pytest.mark.parametrize("way", [0, 1])
+@pytest.mark.parametrize("way", [0, pytest.param(1, marks=pytest.mark.slow("flies the other way"))])
 def test_from_wherever_a_way_is_known_the_goal_is_reached_in_about_that_time_and_no_wall_is_touched(ring, way):
     chip, field, robot, *routes = ring
     route = routes[way]

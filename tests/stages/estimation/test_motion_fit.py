@@ -120,6 +120,7 @@ def test_the_rate_of_the_movies_clock_is_found_to_a_thousandth(rate: float) -> N
     assert found.offset_s + found.rate * (middle_s / rate + 2.0) == pytest.approx(middle_s - 0.04, abs=3e-3)
 
 
+@pytest.mark.slow("fits a movie to a long log")
 def test_a_movie_from_the_middle_of_a_long_log_on_another_clock() -> None:
     log = commands(5, 400.0)
     stamps, positions = track(log, 5, 220.0, still)
@@ -150,6 +151,7 @@ def test_one_wrong_position_in_thirty_does_not_hide_the_log() -> None:
     assert found.offset_s == pytest.approx(-0.04, abs=3e-3)
 
 
+@pytest.mark.slow("fits a movie with another particle")
 def test_frames_without_the_robot_and_positions_of_another_particle_neither_hide_the_log_nor_move_the_offset() -> None:
     log = commands(8, 20.0)
     stamps, positions = track(log, 8, 20.0)

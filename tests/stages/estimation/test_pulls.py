@@ -148,6 +148,7 @@ def test_the_filter_states_the_error_of_its_flow_where_its_model_is_right(wander
     assert 0.9 < rms(pulls) < 1.1
 
 
+@pytest.mark.slow("many flights of the observer")
 def test_observations_of_the_smoother_state_their_errors_and_neighbours_have_errors_of_their_own(
     wanderers: list[Swim],
 ) -> None:
@@ -177,6 +178,7 @@ def test_a_run_of_observations_states_the_error_of_its_mean_and_each_of_them_twi
     assert 0.45 < rms(each) < 0.65
 
 
+@pytest.mark.slow("many flights of the observer")
 def test_an_observation_lies_nearer_to_where_its_flow_was_than_the_robot_does_or_the_whole_memory_ago(
     surveys: list[tuple[Swim, list[Estimate], Observations]],
 ) -> None:

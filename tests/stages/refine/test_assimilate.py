@@ -273,6 +273,7 @@ def test_a_skewed_inlet_is_found_where_it_may_be_one(twin):
     assert case.error(free) < 0.3 * case.error(plain)
 
 
+@pytest.mark.slow("refines for every depth")
 def test_an_unknown_depth_is_found_where_it_may_be_one(twin):
     case = twin()
     chip = replace(case.chip, depth_um=60.0)
@@ -315,6 +316,7 @@ def test_less_what_the_registration_does_the_observations_lie_on_the_flow(twin):
     assert np.sqrt((off**2).mean()) < 0.01 * np.sqrt((flow_um_s**2).mean())
 
 
+@pytest.mark.slow("refines a flow with strong inertia")
 def test_a_fit_whose_inertia_frozen_factors_can_not_follow_keeps_the_last_step_that_shrank(twin):
     case = twin(noise=0.01, scale=2500.0, assumed=(30.0, 0.0, 0.0))  # Re of 170, from a quarter of it
     refined = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)

@@ -62,6 +62,7 @@ def test_a_flow_that_no_cause_explains_is_said_where_it_is_and_its_bars_reach_wh
     assert map_doubts(field, case.chip.um_per_px, scale_known=True) == [doubt]  # of the flow, whatever the scale
 
 
+@pytest.mark.slow("refines a survey of a flow that wanders")
 def test_a_wander_of_the_flow_is_no_explanation_and_is_not_said_beside_what_nothing_explains(twin):
     case = twin(every=1)
     seen = slower_at(case, 0.4)
@@ -83,6 +84,7 @@ def test_chance_and_single_outliers_are_no_departure(twin):
             assert map_doubts(field, case.chip.um_per_px) == []
 
 
+@pytest.mark.slow("refines surveys of several seeds")
 def test_noise_that_is_twice_as_large_as_stated_is_no_departure(twin):
     for seed in range(2):
         case = twin(every=2, seed=seed, noise=0.1)

@@ -169,7 +169,9 @@ def test_the_exponent_of_a_law_of_viscosity_is_said_on_the_right_side(exponent):
     within(sentence, "viscosity exponent {}", exponent)
 
 
-@pytest.mark.parametrize(("pixels", "drawn"), [(-1, "wide"), (1, "narrow")])
+@pytest.mark.parametrize(
+    ("pixels", "drawn"), [(-1, "wide"), pytest.param(1, "narrow", marks=pytest.mark.slow("refines in the other walls"))]
+)
 def test_a_mask_that_is_a_pixel_off_everywhere_is_said_on_the_right_side(pixels, drawn):
     true, settings = wider_everywhere(chip(TRUE), pixels), Assimilate(doubt_depth=False)
     for radius_um in (None, RADIUS_UM):  # of a robot, None: it is not stated

@@ -60,18 +60,21 @@ def misses(done: list[tuple[Track, Appearance | None]], made: RobotMovie) -> np.
     return np.array([track.position_um for track, _ in done]) - made.centres_px
 
 
+LOOK = pytest.mark.slow("follows a robot of another look")
+
+
 @pytest.mark.parametrize(
     ("name", "rmse_px"),
     [
         ("spot, 12 bit", 0.25),
-        ("spot, bleaching by 70 %", 0.4),
+        pytest.param("spot, bleaching by 70 %", 0.4, marks=LOOK),
         ("ring, drifting out of focus", 0.15),
-        ("Janus, 20 degrees a frame", 0.8),
+        pytest.param("Janus, 20 degrees a frame", 0.8, marks=LOOK),
         ("Janus, 60 degrees a frame", 0.8),
         ("helix, rolling and turning", 0.5),
         ("radius 1.5 px", 0.12),
-        ("ring of 40 px", 0.3),
-        ("3 radii a frame", 0.12),
+        pytest.param("ring of 40 px", 0.3, marks=LOOK),
+        pytest.param("3 radii a frame", 0.12, marks=LOOK),
         ("crossing dark neighbours", 0.25),
     ],
 )
