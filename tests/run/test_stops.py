@@ -153,9 +153,8 @@ def test_ctrl_z_stops_the_process_with_the_field_off_and_fg_ends_the_run(tmp_pat
     assert events(done) == [("zero", "operator: zero field (SIGTSTP: Ctrl-Z)")]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("zero() takes 30 ms, SIGINT twice", marks=PROCESS), "zero() raises 5 times, SIGINT twice"]
-)
+@PROCESS
+@pytest.mark.parametrize("name", ["zero() takes 30 ms, SIGINT twice", "zero() raises 5 times, SIGINT twice"])
 def test_no_ctrl_c_interrupts_zero_and_one_that_raises_is_repeated(name: str, tmp_path: Path) -> None:
     done = ended(name, tmp_path, PATIENT)
     told = [event for event, _ in done.after_cause() if event.startswith("zero")]

@@ -109,6 +109,7 @@ def test_calibrate_motion_at_the_command_line_takes_another_log_on_another_clock
     assert "the log explains" in refused and refused.count("\n") == 1 and not (tmp_path / "b.toml").exists()
 
 
+@pytest.mark.slow("aligns a whole movie by its motion")
 def test_calibrate_motion_refuses_headings_that_are_not_those_of_the_run(imported: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="the log explains"):
         calibrate_motion(imported, late_log(tmp_path / "other.csv", 0.0, heading=3.0))
