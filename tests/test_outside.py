@@ -189,6 +189,7 @@ def test_settings_of_a_package_are_checked_like_ours_and_shown_by_a_dry_run(site
     assert "lab-kit-routes" in helped.out and "Print the routes" in helped.out
 
 
+@pytest.mark.slow("ten verbs in processes without the package")
 def test_without_the_package_its_session_is_read_and_a_replay_says_what_to_install(flown: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     *refused, replanned, again, checked, shown, drawn, typo = flowrec(
