@@ -135,7 +135,7 @@ def test_the_same_session_gives_the_same_bytes_twice_and_outputs_are_not_replace
     session = part_of(MODERATE, tmp_path / "s.mcap", 30)
     monkeypatch.setattr(command, "_figures", lambda *_: [TimelineFigure()])
     monkeypatch.setattr(command, "_page", lambda data, *_: pages.draw_figure(TimelineFigure(), data))
-    monkeypatch.setattr("flowrec.exports.render", lambda drawn: drawn.wide)
+    monkeypatch.setattr(command, "render", lambda drawn: drawn.wide)
     first = flowrec.report(session, figures=tmp_path / "figures")
     assert first == tmp_path / "s_report.html"
     before = {path: path.read_bytes() for path in [first, *(tmp_path / "figures").glob("*mm.*")]}
