@@ -53,15 +53,20 @@ class AmplifierSettings:
         Exact for V = R i + L di/dt with V constant over a step: i' = a i + (1 - a) V / R with a = exp(-R step / L).
         V is a weighted mean of R i + L di/dt over the step, so it never exceeds the maximum of that expression.
         """
-        ohm, henry = self.ohm, self.henry
-        voltages = ohm * currents_a[:-1]
-        change = np.diff(currents_a, axis=0)
-        for c in np.flatnonzero(henry > 0.0):
-            # R (i' - a i) / (1 - a) = R i + R (i' - i) / (1 - a); -expm1 keeps its digits where R is small.
-            per_step = step_s / henry[c]
-            slope = ohm[c] / -np.expm1(-ohm[c] * per_step) if ohm[c] > 0.0 else 1.0 / per_step
-            voltages[:, c] += slope * change[:, c]
+        voltages: Floats = self.ohm * currents_a[:-1] + self.slope_ohm(step_s) * np.diff(currents_a, axis=0)
         return voltages
+
+    def slope_ohm(self, step_s: float) -> Floats:
+        """(3,) output volts per ampere of change within a step, besides R times the current at its beginning.
+
+        R (i' - a i) / (1 - a) = R i + R (i' - i) / (1 - a); -expm1 keeps its digits where R is small.
+        """
+        slope = np.zeros(3)
+        for c, (ohm, henry) in enumerate(zip(self.ohm, self.henry, strict=True)):
+            if henry > 0.0:
+                per_step = step_s / henry
+                slope[c] = ohm / -np.expm1(-ohm * per_step) if ohm > 0.0 else 1.0 / per_step
+        return slope
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -67,23 +67,23 @@ class Coils:
         frequency_hz = min(speed_um_s / robot.um_per_rev, limit_hz)
         state = FieldState(now.phase_rad, now.plane_rad if now.amplitude_mt > 0.0 else heading, amplitude_mt)
         command = FieldCommand(frequency_hz, heading, amplitude_mt, limit_hz, self.ramp_mt_s)
-        currents, voltages = self.output_samples(state, command, 1)
+        currents_a, voltages_v = self._outputs_now(state, command)
         return Currents(
             stamp_ns=demand.stamp_ns,
             frequency_hz=frequency_hz,
             heading_rad=heading,
             amplitude_mt=amplitude_mt,
             phase_rad=now.phase_rad,
-            currents_a=currents[0],
+            currents_a=currents_a,
             saturated=full_mt < self.amplitude_mt,
             plane_rad=state.plane_rad,
             limit_hz=limit_hz,
-            voltages_v=voltages[0],
+            voltages_v=voltages_v,
         )
 
     def full_mt(self, robot: Robot) -> float:
         """The amplitude to run at: the nominal one, or what currents and voltages permit for this robot."""
-        return field_limits(self).operating_amplitude_mt(_follow_hz(robot))
+        return _operating_mt(self, _follow_hz(robot))
 
     def fastest_um_s(self, robot: Robot) -> float:
         """Speed of the robot at the highest frequency at which it follows that amplitude."""
@@ -108,8 +108,7 @@ class Coils:
     def field_mt(self, phase_rad: ArrayLike, plane_rad: ArrayLike, amplitude_mt: ArrayLike) -> Floats:
         """(..., 3) field for phases, planes and amplitudes of one shape (...), or that broadcast to it."""
         phase, plane, amplitude = np.broadcast_arrays(phase_rad, plane_rad, amplitude_mt)
-        reversed_ = self.surface == "ceiling" if self.mode == "roller" else self.handedness == "left"
-        horizontal = amplitude * np.sin(phase) * (-1.0 if reversed_ else 1.0)
+        horizontal = amplitude * np.sin(phase) * self._sense
         c, s = np.cos(plane), np.sin(plane)
         x, y = (c, s) if self.mode == "roller" else (s, -c)
         return np.stack([horizontal * x, horizontal * y, amplitude * np.cos(phase)], -1)
@@ -132,6 +131,32 @@ class Coils:
         amplitude = motion.amplitude(time)
         currents = self.currents_a(self.field_mt(motion.phase(time), motion.plane(time), amplitude), amplitude)
         return currents, self.amplifier.sample_and_hold_v(currents, 1.0 / rate)
+
+    def _outputs_now(self, state: FieldState, command: FieldCommand) -> tuple[Floats, Floats]:
+        """Currents (3,) now and voltages (3,) of the first sample: `output_samples` of one, in plain numbers.
+
+        Every tick asks for it, and NumPy takes ten times as long for as few numbers.
+        """
+        motion = field_motion(state, command)
+        now, then = (self._currents_of(motion.after(time_s)) for time_s in (0.0, 1.0 / self.amplifier.output_hz))
+        hold = zip(*_hold_ohm(self), now, then, strict=True)
+        volts = [ohm * first + slope * (second - first) for ohm, slope, first, second in hold]
+        return np.array(now), np.array(volts)
+
+    def _currents_of(self, state: FieldState) -> list[float]:
+        """Coil currents (3) of a state of the field, by the equations of `field_mt` and `currents_a`."""
+        inverse, bias_a = _inverse_and_bias(self)
+        amplitude, c, s = state.amplitude_mt, math.cos(state.plane_rad), math.sin(state.plane_rad)
+        horizontal = self._sense * amplitude * math.sin(state.phase_rad)
+        x, y = (c, s) if self.mode == "roller" else (s, -c)
+        bx, by, bz = horizontal * x, horizontal * y, amplitude * math.cos(state.phase_rad)
+        weight = min(amplitude / self.fade_mt, 1.0)
+        return [p * bx + q * by + r * bz - weight * a for (p, q, r), a in zip(inverse, bias_a, strict=True)]
+
+    @property
+    def _sense(self) -> float:
+        """1, or -1 where the field rotates the other way: for a roller under the ceiling and a left-handed helix."""
+        return -1.0 if (self.surface == "ceiling" if self.mode == "roller" else self.handedness == "left") else 1.0
 
     def check(self, where: str) -> None:
         """Refuse settings that are each within their range but together produce no field.
@@ -175,6 +200,24 @@ class Coils:
 def _follow_hz(robot: Robot) -> float:
     """Frequency up to which the robot follows the nominal amplitude, with the step-out margin."""
     return robot.step_out_margin * robot.step_out_hz
+
+
+@lru_cache(maxsize=16)
+def _operating_mt(coils: Coils, follow_hz: float) -> float:
+    return field_limits(coils).operating_amplitude_mt(follow_hz)
+
+
+@lru_cache(maxsize=16)
+def _inverse_and_bias(coils: Coils) -> tuple[list[list[float]], list[float]]:
+    limits = field_limits(coils)
+    return limits.inverse.tolist(), limits.bias_a.tolist()
+
+
+@lru_cache(maxsize=16)
+def _hold_ohm(coils: Coils) -> tuple[list[float], list[float]]:
+    """Volts of each coil per ampere at the beginning of an output sample, and per ampere of change within it."""
+    amplifier = coils.amplifier
+    return amplifier.ohm.tolist(), amplifier.slope_ohm(1.0 / amplifier.output_hz).tolist()
 
 
 @lru_cache(maxsize=16)

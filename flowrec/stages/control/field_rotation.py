@@ -91,10 +91,15 @@ class FieldMotion:
         return np.where(step < abs(change), self.amplitude_mt + np.copysign(step, change), self.command.amplitude_mt)
 
     def after(self, time_s: float) -> FieldState:
-        """The state of the field at a time."""
-        return FieldState(
-            float(self.phase(time_s)) % _TURN_RAD, wrap_rad(float(self.plane(time_s))), float(self.amplitude(time_s))
-        )
+        """The state of the field at a time: the three functions above, in plain numbers for the control loop."""
+        command, change = self.command, self.command.amplitude_mt - self.amplitude_mt
+        phase = self.phase_rad + self.direction * _TURN_RAD * command.frequency_hz * time_s
+        plane = self.plane_rad + self.slew_rad_s * time_s if time_s < self.slew_s else self.plane_end_rad
+        amplitude = self.amplitude_mt
+        if change != 0.0 and time_s > 0.0:
+            step = command.ramp_mt_s * time_s
+            amplitude = amplitude + math.copysign(step, change) if step < abs(change) else command.amplitude_mt
+        return FieldState(phase % _TURN_RAD, wrap_rad(plane), amplitude)
 
     def heading_rad(self, time_s: float) -> float:
         """Direction in which the robot travels at a time."""

@@ -203,3 +203,16 @@ def test_a_plan_is_made_for_the_speed_that_the_coils_leave_the_robot():
     share = 1.5 * 1.5 / 4.0  # of the full field, by the z coil
     assert resolved.robot.max_speed_um_s == pytest.approx(600.0 * 1.2 * 0.9 * share, abs=0.1)
     assert resolve(resolved, load_chip(config.chip)).robot == resolved.robot
+
+
+@pytest.mark.parametrize("kind, ramp_s", [("current", 0.0), ("current", 0.2), ("voltage", 0.2)])
+@pytest.mark.parametrize("mode", ["roller", "helix"])
+def test_a_tick_states_the_first_of_the_samples_that_a_card_puts_out(mode, kind, ramp_s):
+    amplifier = AmplifierSettings(kind=kind, resistance_ohm=(2.0, 0.0, 1.0), inductance_mh=(5.0, 4.0, 0.0))
+    coils = Coils(mode, "ceiling", "left", mt_per_a=SKEWED, bias_mt=BIAS, ramp_s=ramp_s, amplifier=amplifier)
+    said = turn(coils, [((120.0, 90.0), 0.3), ((-70.0, -130.0), 0.3), ((0.0, 0.0), 0.1)], step_ms=7)
+    said += turn(coils, [((120.0, 90.0), 0.3)], said[-1], step_ms=7, finished=True)
+    for currents in said:
+        samples_a, samples_v = coils.output_samples(*coils.state_and_command(currents), 1)
+        np.testing.assert_allclose(currents.currents_a, samples_a[0], rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(currents.voltages_v, samples_v[0], rtol=1e-10, atol=1e-12)
