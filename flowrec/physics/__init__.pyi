@@ -41,7 +41,7 @@ from .flow.newton_solver import (
     newton_equations as newton_equations, system as system, with_friction as with_friction,
 )
 from .flow.sampling import (
-    fluid_image as fluid_image, relative_rmse as relative_rmse, sample as sample, sample_as_seen as sample_as_seen,
+    MapRaster as MapRaster, fluid_image as fluid_image, raster_velocity as raster_velocity, relative_rmse as relative_rmse, sample as sample, sample_as_seen as sample_as_seen,
     walls_of as walls_of,
 )
 from .flow.sensitivities import Remainder as Remainder, Sensitivities as Sensitivities, sensitivities as sensitivities

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import Bools, Floats, FlowError, FlowField
+from flowrec.core import Bools, Floats, FlowError, FlowField, compiled
 from flowrec.physics.chip.registration import on_chip
 from flowrec.physics.flow.velocity_stencil import velocities_at, velocity_at
 
-_NO_WALLS = np.zeros((0, 0), np.float32)
-_NO_WALLS.flags.writeable = False
+_NO_WALLS, _NO_MAP, _AS_STATED = np.zeros((0, 0), np.float32), np.zeros((0, 0, 2), np.float32), np.eye(2, 3)
+for _each in (_NO_WALLS, _NO_MAP, _AS_STATED):
+    _each.flags.writeable = False  # as the arrays of messages are: kernels are compiled for either kind
 
 
 def sample(field: FlowField, points_um: ArrayLike) -> Floats:
@@ -41,6 +42,44 @@ def sample_as_seen(field: FlowField, points_um: ArrayLike) -> Floats:
     (xx, xy, _), (yx, yy, _) = field.registration
     x, y = velocity[..., 0], velocity[..., 1]
     return np.asarray(np.stack((yy * x - xy * y, xx * y - yx * x), -1) / (xx * yy - xy * yx))
+
+
+class MapRaster(NamedTuple):
+    """A flow field, or none, as the kernels of the control loop take it."""
+
+    velocity_um_s: NDArray[np.float32]  # (h, w, 2); of no pixels without a field
+    wall_px: NDArray[np.float32]
+    um_per_px: float
+    registration: Floats  # (2, 3)
+
+    @classmethod
+    def of(cls, field: FlowField | None, *, as_seen: bool = True) -> MapRaster:
+        """The raster of a field, with its registration for `sample_as_seen` and without it for `sample`."""
+        if field is None:
+            return cls(_NO_MAP, _NO_WALLS, 1.0, _AS_STATED)
+        stated = field.registration is None or not as_seen
+        return cls(field.velocity_um_s, walls_of(field), field.um_per_px, _AS_STATED if stated else field.registration)
+
+
+@compiled
+def raster_velocity(
+    velocity: NDArray[np.float32],
+    wall_px: NDArray[np.float32],
+    um_per_px: float,
+    registration: Floats,
+    x_um: float,
+    y_um: float,
+) -> tuple[float, float]:
+    """Velocity of a MapRaster at one point in um, as `sample_as_seen`; compiled, for other kernels."""
+    xx, xy, yx, yy = registration[0, 0], registration[0, 1], registration[1, 0], registration[1, 1]
+    x = (xx * x_um + xy * y_um + registration[0, 2]) / um_per_px
+    y = (yx * x_um + yy * y_um + registration[1, 2]) / um_per_px
+    h, w = velocity.shape[:2]
+    if not (x >= -0.5 and y >= -0.5 and x <= w - 0.5 and y <= h - 0.5):
+        return 0.0, 0.0
+    u, v = velocity_at(velocity, wall_px, x, y)
+    area = xx * yy - xy * yx
+    return (yy * u - xy * v) / area, (xx * v - yx * u) / area
 
 
 def walls_of(field: FlowField) -> NDArray[np.float32]:

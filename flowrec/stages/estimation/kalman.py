@@ -28,8 +28,8 @@ from flowrec.physics import OBSERVER, Robot, sample_as_seen
 from flowrec.stages.estimation.process_model import (
     ISOTROPIC,
     StateLayout,
+    advance_covariance,
     gradient_at,
-    process_noise,
     propagate,
 )
 
@@ -112,8 +112,8 @@ class Kalman:
                 kalman.P[:2, :2] *= self.gate_growth
         slopes = kalman.x[4:7] if layout.gradient else _NONE
         if field is not None:
-            gradient = gradient_at(field, kalman.x[:2])
-            slopes = np.array([0.5 * (gradient[0, 0] - gradient[1, 1]), gradient[0, 1], gradient[1, 0]])
+            xx, xy, yx, yy = gradient_at(field, float(kalman.x[0]), float(kalman.x[1]))
+            slopes = np.array([0.5 * (xx - yy), xy, yx])
         return Estimate(
             stamp_ns=track.stamp_ns,
             position_um=kalman.x[:2],
@@ -144,29 +144,27 @@ class Kalman:
         ahead, jacobian = propagate(
             state, layout, applied.turns, robot.um_per_rev, dt, field, constant_flow=not previous.seen
         )
-        covariance = jacobian @ covariance @ jacobian.T + self._noise(previous, layout, ahead - state, dt, robot, field)
-        return ahead, covariance, layout, jacobian
+        change = math.dist(ahead[:2].tolist(), state[:2].tolist())
+        noise = self._noise(previous, change, dt, robot, field)
+        return ahead, advance_covariance(covariance, jacobian, *layout, dt, *noise), layout, jacobian
 
     def layout(self, field: FlowField | None = None) -> StateLayout:
         """Components of the state."""
         return StateLayout(gradient=field is None and self.flow_noise_um2_s3 is None, gain=self.estimate_gain)
 
     def _noise(
-        self, previous: Estimate, layout: StateLayout, change: Floats, dt: float, robot: Robot, field: FlowField | None
-    ) -> Floats:
-        """(n, n) covariance of the process noise of a step that changes the state by (n,)."""
+        self, previous: Estimate, moved_um: float, dt: float, robot: Robot, field: FlowField | None
+    ) -> tuple[float, float, float, float]:
+        """Variances of the process noise of a step, as of `advance_covariance`: flow, gradient, gain and drift."""
         gain = (_GAIN_DRIFT * robot.um_per_rev) ** 2 * dt
         share = 1.0 if field is None else OBSERVER.of(field, self.map_share) ** 2
         if self.flow_noise_um2_s3 is not None:
-            q = self.flow_noise_um2_s3 * share
-            return process_noise(layout, dt, q * dt, 0.0, gain, self.drift_um2_s)
-        displacement = math.hypot(*change[:2]) + _REST_FRACTION * robot.max_speed_um_s * dt
-        flow = previous.flow_um_s
-        speed = math.hypot(*flow, _SLOWEST_FRACTION * robot.max_speed_um_s)
+            return self.flow_noise_um2_s3 * share * dt, 0.0, gain, self.drift_um2_s
+        displacement = moved_um + _REST_FRACTION * robot.max_speed_um_s * dt
+        speed = math.hypot(*previous.flow_um_s, _SLOWEST_FRACTION * robot.max_speed_um_s)
         unit = self.agility * self._noise_scale(previous, robot, dt) * displacement / robot.radius_um * speed**2
         unit *= share
-        gradient = self.slope_change * unit / robot.radius_um**2
-        return process_noise(layout, dt, self.flow_change * unit, gradient, gain, self.drift_um2_s)
+        return self.flow_change * unit, self.slope_change * unit / robot.radius_um**2, gain, self.drift_um2_s
 
     def _innovation_weight(self, robot: Robot, dt: float) -> float:
         """Weight of the newest innovation in their exponential mean."""

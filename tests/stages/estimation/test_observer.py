@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from flowrec.core.declarations import as_read
 from flowrec.core.messages import Applied, Estimate, FlowField, Track
 from flowrec.stages.estimation import HealthMonitor, Kalman, Luenberger, Observer, Sampler
+from flowrec.stages.estimation.process_model import StateLayout, advance_covariance, propagate
 from tests.stages.estimation.lap import RATE_HZ, ROBOT, across, lemniscate, vortex
 
 
@@ -82,6 +84,32 @@ def test_the_process_noise_is_that_of_van_loans_integral() -> None:
     assert exact[0, 2] == pytest.approx(0.5 * q * dt**2)
     # Seconds to the ninth decimal, as stamps have them.
     np.testing.assert_allclose(covariance - step @ first.covariance @ step.T, exact, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("layout", [StateLayout(a, b) for a in (False, True) for b in (False, True)])
+def test_a_step_has_the_derivative_of_its_motion_and_the_covariance_of_filterpy(layout: StateLayout) -> None:
+    rng, n, dt = np.random.default_rng(1), layout.size, 1.0 / RATE_HZ
+    state = np.array([100.0, 50.0, 80.0, -30.0, 0.7, -0.4, 1.1][: 4 + 3 * layout.gradient] + [21.0] * layout.gain)
+    turns = np.array([0.3, -0.2])
+
+    def ahead(of: NDArray[np.float64]) -> NDArray[np.float64]:
+        return propagate(of, layout, turns, 20.0, dt, None, False)[0]
+
+    jacobian = propagate(state, layout, turns, 20.0, dt, None, False)[1]
+    differences = np.column_stack([ahead(state + step) - ahead(state - step) for step in 0.5 * np.eye(n)])
+    np.testing.assert_allclose(jacobian[2:], differences[2:], rtol=1e-9, atol=1e-9)
+    # The position leaves out what the change of the flow within the step adds to it, which is of second order.
+    second_order = 0.5 * dt * (jacobian[2:4] - np.eye(2, n, 2))
+    np.testing.assert_allclose(jacobian[:2] + second_order, differences[:2], rtol=1e-9, atol=1e-9)
+    root = rng.standard_normal((n, n))
+    kalman = KalmanFilter(dim_x=n, dim_z=2)
+    kalman.F, kalman.P = jacobian, root @ root.T
+    noise = (*layout, dt, 300.0, 0.02, 0.1, 4.0)
+    kalman.Q = advance_covariance(np.zeros((n, n)), jacobian, *noise)
+    assert np.linalg.eigvalsh(kalman.Q).min() >= -1e-12
+    assert np.count_nonzero(np.diag(kalman.Q)) == n
+    kalman.predict()
+    np.testing.assert_allclose(advance_covariance(root @ root.T, jacobian, *noise), kalman.P, rtol=1e-11, atol=1e-11)
 
 
 def test_two_frames_without_the_robot_widen_the_belief_as_one_of_both_lengths() -> None:
