@@ -57,8 +57,8 @@ class MapRaster(NamedTuple):
         """The raster of a field, with its registration for `sample_as_seen` and without it for `sample`."""
         if field is None:
             return cls(_NO_MAP, _NO_WALLS, 1.0, _AS_STATED)
-        stated = field.registration is None or not as_seen
-        return cls(field.velocity_um_s, walls_of(field), field.um_per_px, _AS_STATED if stated else field.registration)
+        registration = field.registration if as_seen and field.registration is not None else _AS_STATED
+        return cls(field.velocity_um_s, walls_of(field), field.um_per_px, registration)
 
 
 @compiled

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flowrec.core import Estimate, Floats, FlowField
-from flowrec.physics import sample
+from flowrec.core import Estimate, Floats, FlowField, compiled, nearest_pixel
+from flowrec.physics import MapRaster, raster_velocity, sample
 
 _MOST_DEMANDS = 100  # remembered, whatever delay and frame rate
 
@@ -43,17 +45,15 @@ def corrected_flow(
     if field is None:
         return CorrectedFlow(None, estimate.flow_um_s)
     mapped = sample(field, estimate.position_um)
-    map_std = map_error * float(np.hypot(*mapped)) + 1.0
-    if field.std_um_s is not None:
-        h, w = field.std_um_s.shape[:2]
-        column, row = np.rint(estimate.position_um / field.um_per_px).astype(int)
-        stated = field.std_um_s[min(max(row, 0), h - 1), min(max(column, 0), w - 1)]
-        map_std = max(0.3 * map_std, float(stated.max()))
+    map_std = map_error * math.hypot(*mapped) + 1.0
+    x, y = (estimate.position_um / field.um_per_px).tolist()
+    if field.std_um_s is not None and math.isfinite(x + y):
+        map_std = max(0.3 * map_std, float(field.std_um_s[nearest_pixel(x, y, field.std_um_s.shape)].max()))
     velocity = mapped + sent_um_s[0] if len(sent_um_s) else mapped
     change = mapped - sample(field, estimate.position_um - lag_s * velocity)
     variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3]) + float(change @ change)
     residual = estimate.flow_um_s - mapped
-    length = float(np.hypot(*residual))
+    length = math.hypot(*residual)
     weight = min(map_std**2 / (map_std**2 + variance), 2.0 * map_std / length if length > 0.0 else 1.0)
     return CorrectedFlow(field, weight * residual)
 
@@ -66,15 +66,37 @@ def predict_position(
     `sent_um_s` (m, 2), oldest first, were sent one frame (dt_s) apart, the last of them a frame ago. A demand takes
     effect one delay after it was sent.
     """
-    point = np.array(position_um, np.float64)
-    elapsed = max(delay_s - len(sent_um_s) * dt_s, 0.0)  # before the first demand only the flow moves the robot
-    point = point + elapsed * flow.at(point)
-    for k in range(len(sent_um_s), 0, -1):
+    (x_um, y_um), (more_x, more_y) = position_um.tolist(), flow.correction_um_s.tolist()
+    raster = MapRaster.of(flow.field, as_seen=False)
+    return np.array(_drift_um(x_um, y_um, sent_um_s, dt_s, delay_s, more_x, more_y, *raster))
+
+
+@compiled
+def _drift_um(
+    x: float,
+    y: float,
+    sent_um_s: Floats,
+    dt_s: float,
+    delay_s: float,
+    more_x: float,
+    more_y: float,
+    velocity: NDArray[np.float32],
+    wall_px: NDArray[np.float32],
+    um_per_px: float,
+    registration: Floats,
+) -> tuple[float, float]:
+    """The point after one delay of the flow, a bilinear raster and a constant, and of the demands (m, 2)."""
+    elapsed, m = 0.0, len(sent_um_s)
+    for k in range(m + 1, 0, -1):  # before the first demand only the flow moves the robot
         until = delay_s - (k - 1) * dt_s  # the demand sent k frames ago acts until its successor does
         if until > elapsed:
-            point = point + (until - elapsed) * (sent_um_s[-k] + flow.at(point))
+            vx, vy = raster_velocity(velocity, wall_px, um_per_px, registration, x, y)
+            vx, vy = vx + more_x, vy + more_y
+            if k <= m:
+                vx, vy = vx + sent_um_s[m - k, 0], vy + sent_um_s[m - k, 1]
+            x, y = x + (until - elapsed) * vx, y + (until - elapsed) * vy
             elapsed = until
-    return point
+    return x, y
 
 
 def append_demand(sent_um_s: Floats, velocity_um_s: Floats, dt_s: float, delay_s: float) -> Floats:

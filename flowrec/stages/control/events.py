@@ -121,11 +121,13 @@ def _health(before: Health | None, health: Health | None) -> Iterator[Line]:
         return
     was = set() if before is None else set(before.alarm.split("; ")) - {""}
     now = set(health.alarm.split("; ")) - {""}
-    texts: dict[str, str] = {
-        Alarm.NIS: f"the robot is moved by what the observer does not know (NIS {health.nis:.1f}, should be 2)",
-        Alarm.PULSATION: f"the flow pulsates at {health.pulsation_hz:.2g} Hz by {health.pulsation_share:.0%}",
-        Alarm.TRACKING: f"the robot is out of sight on {health.lost_share:.0%} of the frames",
-    }
+    texts: dict[str, str] = {}
+    if now - was:
+        texts = {
+            Alarm.NIS: f"the robot is moved by what the observer does not know (NIS {health.nis:.1f}, should be 2)",
+            Alarm.PULSATION: f"the flow pulsates at {health.pulsation_hz:.2g} Hz by {health.pulsation_share:.0%}",
+            Alarm.TRACKING: f"the robot is out of sight on {health.lost_share:.0%} of the frames",
+        }
     for text in [texts[name] for name in sorted(now - was)] + [f"alarm over: {name}" for name in sorted(was - now)]:
         yield text, Level.WARNING if now else None
     was_hz = before.limit_hz if before is not None else None

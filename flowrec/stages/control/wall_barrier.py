@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, cell_at
+from flowrec.core import Floats, bilinear, cell_at, compiled
 from flowrec.stages.control.tracking_laws import Situation, limit_length
 
 _LEAST_SLOPE = 0.3  # below this gradient of the clearance the point is in the middle between two walls
@@ -30,13 +30,9 @@ def wall_barrier(
     per_s : largest ratio of the speed towards a wall to the remaining distance.
     """
     if now.route is not None:
-        waypoints = now.route.waypoints_um
-        distance = np.hypot(waypoints[:, 0] - now.predicted_um[0], waypoints[:, 1] - now.predicted_um[1])
-        near_um = waypoints[distance < _NEAR_RADII * now.robot.radius_um]
-        some_um = near_um[:: len(near_um) // _MOST_WAYPOINTS + 1]
-        gap_um = min(
-            (clearance_and_slope(clearance_um, point / now.um_per_px)[0] for point in some_um), default=math.inf
-        )
+        x_um, y_um = now.predicted_um.tolist()
+        near_um = _NEAR_RADII * now.robot.radius_um
+        gap_um = _narrowest_um(now.route.waypoints_um, x_um, y_um, near_um, clearance_um, now.um_per_px)
         keep_um = min(keep_um, max(gap_um, now.robot.radius_um))
     clearance, slope = clearance_and_slope(clearance_um, now.predicted_um / now.um_per_px)
     steepness = math.hypot(*slope) / now.um_per_px
@@ -44,6 +40,24 @@ def wall_barrier(
         away = slope / (steepness * now.um_per_px)
         demand_um_s = constrain(demand_um_s, now.flow_um_s, away, clearance - keep_um, per_s)
     return limit_length(demand_um_s, now.limit_um_s)
+
+
+@compiled
+def _narrowest_um(
+    waypoints_um: Floats, x_um: float, y_um: float, near_um: float, clearance_um: NDArray[np.float32], um_per_px: float
+) -> float:
+    """Least clearance at some 16 of the waypoints (n, 2) that are near a point; infinite if none is."""
+    count = 0
+    for k in range(len(waypoints_um)):
+        count += math.hypot(waypoints_um[k, 0] - x_um, waypoints_um[k, 1] - y_um) < near_um
+    stride, number, least = count // _MOST_WAYPOINTS + 1, 0, math.inf
+    for k in range(len(waypoints_um)):
+        if math.hypot(waypoints_um[k, 0] - x_um, waypoints_um[k, 1] - y_um) < near_um:
+            if number % stride == 0:
+                here_um = bilinear(clearance_um, waypoints_um[k, 0] / um_per_px, waypoints_um[k, 1] / um_per_px)
+                least = min(least, here_um)
+            number += 1
+    return least
 
 
 def constrain(demand_um_s: Floats, flow_um_s: Floats, away: Floats, left_um: float, per_s: float) -> Floats:

@@ -21,13 +21,10 @@ from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Alarm, Applied, Estimate, Floats, FlowField, Health, Range, Share, seconds
+from flowrec.core import Alarm, Applied, Estimate, Floats, FlowField, Health, Range, Share, compiled, seconds
 from flowrec.physics import Robot, sample_as_seen
 from flowrec.stages.estimation.step_out import StepOut
-
-Resonators = NDArray[np.complex128]
 
 _BANK_HZ, _STEP, _ABOVE = 0.3, 1.125, 24  # of the bank: a frequency, the ratio of neighbours, how many from there on
 _EXPECTED_NIS = 2.0
@@ -76,10 +73,7 @@ class HealthMonitor:
         """
         bank_hz = _bank_hz(self.slowest_hz)
         if previous is None or before is None:
-            bank = np.zeros(len(bank_hz))
-            return Health(
-                estimate.stamp_ns, "", _EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0
-            )
+            return _first_health(estimate.stamp_ns, np.zeros(len(bank_hz)))
         dt = max(seconds(estimate.stamp_ns - before.stamp_ns), 0.0)
         weight = min(dt / self.window_s, 1.0)
         lost = previous.lost_share + weight * (float(not estimate.seen) - previous.lost_share)
@@ -87,7 +81,7 @@ class HealthMonitor:
         if math.isfinite(estimate.nis):
             nis += weight * (min(estimate.nis, _LARGEST_NIS) - nis)
         settled_s, mean, offset = previous.heard_s, previous.mean_um_s, previous.offset_share
-        z, power = previous.bank_re + 1j * previous.bank_im, previous.bank_power
+        deviation = heard_s = 0.0
         variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3])
         if estimate.seen and dt > 0.0 and variance < (self.settled_share * robot.max_speed_um_s) ** 2:
             settled_s += dt
@@ -95,9 +89,13 @@ class HealthMonitor:
             expected = mean if field is None else sample_as_seen(field, estimate.position_um)
             deviation = _flow_deviation(estimate, expected, robot)
             offset += weight * (deviation - offset)
-            z, power = self._resonate(z, power, deviation - offset, dt, seconds(estimate.stamp_ns))
-        strongest = int(np.argmax(np.abs(z)))
-        amplitude = 2.0 * float(np.abs(z[strongest]))
+            deviation, heard_s = deviation - offset, dt
+        bank = previous.bank_re, previous.bank_im, previous.bank_power
+        time_s = seconds(estimate.stamp_ns)
+        re, im, power = _resonate(bank_hz, self.periods, *bank, deviation, heard_s, time_s)
+        sizes = np.abs(re + 1j * im)
+        strongest = int(sizes.argmax())
+        amplitude = 2.0 * float(sizes[strongest])
         line = min(0.5 * amplitude**2 / float(power[strongest]), 1.0) if power[strongest] > 0.0 else 0.0
         nis_std = self.nis_sigma * math.sqrt(2.0 * weight)
         levels = {  # relative to the thresholds
@@ -105,34 +103,48 @@ class HealthMonitor:
             Alarm.PULSATION: min(amplitude / self.pulsation_share, line / self.line_share, settled_s / self.settle_s),
             Alarm.TRACKING: lost / self.lost_share,
         }
-        active = previous.alarm.split("; ")
-        alarms = [name for name, level in levels.items() if level > (self.ends_at if name in active else 1.0)]
         now = replace(
             previous,
             stamp_ns=estimate.stamp_ns,
-            alarm="; ".join(alarms),
+            alarm=self._alarms(previous.alarm.split("; "), levels),
             nis=nis,
             lost_share=lost,
             heard_s=settled_s,
             pulsation_hz=float(bank_hz[strongest]),
             pulsation_share=amplitude,
             line_share=line,
-            bank_re=z.real,
-            bank_im=z.imag,
+            bank_re=re,
+            bank_im=im,
             bank_power=power,
             mean_um_s=mean,
             offset_share=offset,
         )
         return now if applied is None else self.step_out.watch(now, before, estimate, applied, field, robot, wall_um)
 
-    def _resonate(
-        self, z: Resonators, power: Floats, deviation: float, dt: float, time_s: float
-    ) -> tuple[Resonators, Floats]:
-        """State (n,) and mean square input (n,) of the resonators after `dt` seconds with an input."""
-        bank_hz = _bank_hz(self.slowest_hz)
-        weights = 1.0 - np.exp(-dt / np.maximum(self.periods / bank_hz, 1.0))
-        phase = np.exp(-2j * math.pi * bank_hz * time_s)
-        return z + weights * (deviation * phase - z), power + weights * (deviation**2 - power)
+    def _alarms(self, active: list[str], levels: dict[Alarm, float]) -> str:
+        return "; ".join(name for name, level in levels.items() if level > (self.ends_at if name in active else 1.0))
+
+
+def _first_health(stamp_ns: int, bank: Floats) -> Health:
+    return Health(stamp_ns, "", _EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0)
+
+
+@compiled
+def _resonate(
+    bank_hz: Floats, periods: float, re: Floats, im: Floats, power: Floats, deviation: float, dt: float, time_s: float
+) -> tuple[Floats, Floats, Floats]:
+    """Real and imaginary part and mean square input (n,) of the resonators after dt seconds with an input.
+
+    With dt = 0 they stay as they are.
+    """
+    after_re, after_im, after_power = re.copy(), im.copy(), power.copy()
+    for k in range(len(bank_hz)):
+        weight = 1.0 - math.exp(-dt / max(periods / bank_hz[k], 1.0))
+        phase = 2.0 * math.pi * bank_hz[k] * time_s
+        after_re[k] += weight * (deviation * math.cos(phase) - re[k])
+        after_im[k] += weight * (-deviation * math.sin(phase) - im[k])
+        after_power[k] += weight * (deviation * deviation - power[k])
+    return after_re, after_im, after_power
 
 
 def _flow_deviation(estimate: Estimate, expected_um_s: Floats, robot: Robot) -> float:
@@ -146,4 +158,6 @@ def _flow_deviation(estimate: Estimate, expected_um_s: Floats, robot: Robot) -> 
 def _bank_hz(slowest_hz: float) -> Floats:
     """(n,) frequencies of the resonators."""
     below = math.floor(math.log(_BANK_HZ / slowest_hz) / math.log(_STEP) + 1e-9)
-    return np.asarray(_BANK_HZ * _STEP ** np.arange(-below, _ABOVE))
+    bank_hz = np.asarray(_BANK_HZ * _STEP ** np.arange(-below, _ABOVE))
+    bank_hz.flags.writeable = False
+    return bank_hz

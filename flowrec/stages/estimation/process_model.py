@@ -57,7 +57,8 @@ def propagate(
     constant_flow : ignore the gradient: it is valid over a frame, but not while the robot is out of sight.
     """
     rolled_um = float(state[-1]) if layout.gain else um_per_rev
-    return _propagate(state, *layout, constant_flow, turns, rolled_um, dt, *MapRaster.of(field))
+    raster = MapRaster.of(field)
+    return _propagate(state, layout.gradient, layout.gain, constant_flow, turns, rolled_um, dt, *raster)
 
 
 @compiled

@@ -205,7 +205,7 @@ def test_a_plan_is_made_for_the_speed_that_the_coils_leave_the_robot():
     assert resolve(resolved, load_chip(config.chip)).robot == resolved.robot
 
 
-@pytest.mark.parametrize("kind, ramp_s", [("current", 0.0), ("current", 0.2), ("voltage", 0.2)])
+@pytest.mark.parametrize(("kind", "ramp_s"), [("current", 0.0), ("current", 0.2), ("voltage", 0.2)])
 @pytest.mark.parametrize("mode", ["roller", "helix"])
 def test_a_tick_states_the_first_of_the_samples_that_a_card_puts_out(mode, kind, ramp_s):
     amplifier = AmplifierSettings(kind=kind, resistance_ohm=(2.0, 0.0, 1.0), inductance_mh=(5.0, 4.0, 0.0))
