@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
+import functools
 import heapq
 import itertools
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,7 @@ from mcap.records import ChunkIndex
 from flowrec.core import Frame, Message, SessionError, pixel_type
 from flowrec.store.channels import Row, SessionContents
 from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
-from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, Summary, records_in
+from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, Summary, lone_count, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.write_queue import NewMessages
 
@@ -35,6 +38,7 @@ _FEW = 64  # messages of a chunk that may wait as objects
 _Decode = Callable[[Record], Record]
 _ChunkContent = bytes | memoryview | list[Record]
 _by_time, _place = attrgetter("log_ns"), attrgetter("chunk_start_offset")
+_in_time = attrgetter("message_start_time", "chunk_start_offset")
 
 
 class FileReader(SessionContents):
@@ -71,6 +75,13 @@ class FileReader(SessionContents):
                 path = self.channels[channel].topic
                 raise DamageError(self.source.path, f"{announced} messages of {path} are announced, {count} were read")
 
+    def announce(self, start_ns: int, fields: Collection[str]) -> None:
+        """Announce that the state before a time and then the messages from it on are read: one round trip for a URL."""
+        channels = self._channels_of(fields)
+        before = _likely(self._chunks_until(start_ns - 1, channels), channels, start_ns - 1)
+        from_it = [sorted(chunks, key=_in_time)[:_AHEAD_AT_FIRST] for chunks in self._chunks_from(start_ns, channels)]
+        self.source.prefetch(itertools.chain(before, *from_it))
+
     def messages(self, field: str) -> Iterator[tuple[int, Any]]:
         """All messages of one topic, each with the stamp of its tick."""
         for record in self._read({field}):
@@ -98,6 +109,32 @@ class FileReader(SessionContents):
                     times = [record.log_ns for record in self.source.messages(chunk) if record.channel == channel]
                 found += times
         return sorted(found)
+
+    def frame(self, number: int) -> Frame | None:
+        """An image by its number, from its chunk alone; None where the summary does not tell which chunk that is."""
+        if self._frame_numbers is None:
+            return None
+        firsts, chunks = self._frame_numbers
+        place = bisect.bisect_right(firsts, number) - 1
+        content = self.source.messages(chunks[place])
+        records = sorted((each for each in content if each.channel in self._frame_channels), key=_by_time)
+        count = lone_count(chunks[place])
+        if len(records) != count:
+            why = f"{count} images are announced, the chunk has {len(records)}"
+            raise self.source.damage_error(chunks[place].chunk_start_offset, why)
+        frame: Frame = self._restore(records[number - firsts[place]])
+        return frame
+
+    @functools.cached_property
+    def _frame_numbers(self) -> tuple[list[int], list[ChunkIndex]] | None:
+        """Chunks with images, in order of time, and the number of the first image of each."""
+        chunks = sorted(self._chunks_with(self._frame_channels), key=_in_time)
+        counts = [lone_count(chunk) for chunk in chunks]
+        if None in counts or any(now.message_start_time <= was.message_end_time for was, now in pairwise(chunks)):
+            return None
+        *firsts, total = itertools.accumulate((count or 0 for count in counts), initial=0)
+        announced = sum(self.statistics.channel_message_counts.get(channel, 0) for channel in self._frame_channels)
+        return (firsts, chunks) if total == announced else None
 
     def state_at(self, stamp_ns: int, fields: Collection[str]) -> tuple[int, NewMessages]:
         """The latest message of each of these topics at or before a stamp, from as few chunks as possible.
@@ -176,6 +213,11 @@ class FileReader(SessionContents):
                 (frames if only_frames else state).append(chunk)
         return state, frames
 
+    def _chunks_until(self, stamp_ns: int, channels: set[int]) -> list[ChunkIndex]:
+        """Chunks of channels that begin at or before a time, the one that ends last first."""
+        chunks = [chunk for chunk in self._chunks_with(channels) if chunk.message_start_time <= stamp_ns]
+        return sorted(chunks, key=lambda chunk: chunk.message_end_time, reverse=True)
+
     def _chunks_with(self, channels: set[int]) -> list[ChunkIndex]:
         # A chunk without an index may contain anything.
         return [
@@ -190,8 +232,7 @@ class FileReader(SessionContents):
     def _latest(self, stamp_ns: int, channels: set[int]) -> dict[str, Record]:
         latest: dict[str, Record] = {}
         sizes: dict[str, int] = {}
-        chunks = [chunk for chunk in self._chunks_with(channels) if chunk.message_start_time <= stamp_ns]
-        chunks.sort(key=lambda chunk: chunk.message_end_time, reverse=True)
+        chunks = self._chunks_until(stamp_ns, channels)
         self.source.prefetch(_likely(chunks, channels, stamp_ns))
         for chunk in chunks:
             end_ns = min(chunk.message_end_time, stamp_ns)
@@ -258,7 +299,7 @@ def _merge(
     ------
     SessionError : a chunk is damaged, or more chunks overlap than fit into memory.
     """
-    waiting = deque(_overlapping(source, sorted(chunks, key=attrgetter("message_start_time", "chunk_start_offset"))))
+    waiting = deque(_overlapping(source, sorted(chunks, key=_in_time)))
     running: deque[tuple[list[ChunkIndex], Future[list[_ChunkContent]]]] = deque()
     ahead_bytes, ahead = 0, _AHEAD_AT_FIRST
     while waiting or running:

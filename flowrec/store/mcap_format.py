@@ -34,6 +34,7 @@ LONG, CRC = struct.Struct("<Q"), struct.Struct("<I")
 FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of the map of channels
 _CHANNEL_BYTES = 10  # channel number and the offset of its own index, which is not read
+_INDEX_HEAD_BYTES, _INDEX_ENTRY_BYTES = RECORD_HEAD.size + 6, 16  # of a MessageIndex record: time and place a message
 _LENGTH_AND_NAME = struct.Struct("<QI")
 _SIZES = struct.Struct("<QQ")
 
@@ -177,6 +178,12 @@ def parse_summary(data: bytes, data_end: int) -> Summary:
     _check_places(summary, data_end)
     _check_counts(summary)
     return summary
+
+
+def lone_count(chunk: ChunkIndex) -> int | None:
+    """Number of messages of a chunk of one channel, from the size of its index; None of others, or without an index."""
+    count, rest = divmod(chunk.message_index_length - _INDEX_HEAD_BYTES, _INDEX_ENTRY_BYTES)
+    return count if len(chunk.message_index_offsets) == 1 and not rest and count >= 0 else None
 
 
 def records_in(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:

@@ -113,13 +113,16 @@ class SessionReader:
         with_frames : without, no image is read and `frame` is None; ticks in which nothing but a frame
             was new are left out.
         """
-        tick = Tick() if start_ns is None else self.tick_before(start_ns - 1, with_frames=with_frames)
+        wanted, tick = self._choose_fields(with_frames=with_frames), Tick()
+        if start_ns is not None:
+            self.file(max(self._begun(start_ns), default=0)).announce(start_ns, wanted)
+            tick = self.tick_before(start_ns - 1, with_frames=with_frames)
         for number, file in enumerate(self._run.files):
             if start_ns is not None and file.last_ns < start_ns:
                 continue
             # A file that is read from its beginning is compared with the counts in its index.
             late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
-            for stamp_ns, new in self.file(number).new_messages(late_ns, self._choose_fields(with_frames=with_frames)):
+            for stamp_ns, new in self.file(number).new_messages(late_ns, wanted):
                 if not number or stamp_ns > file.first_ns:
                     tick = self.topics.with_messages(tick, stamp_ns, new)
                     yield tick
@@ -130,7 +133,7 @@ class SessionReader:
         `tick_before(start_ns - 1)` holds the same objects as the state from which `ticks(start_ns)` starts, so that a
         message of its first tick is new if and only if it is another object.
         """
-        begun = [number for number, file in enumerate(self._run.files) if file.first_ns <= stamp_ns]
+        begun = self._begun(stamp_ns)
         wanted = self._choose_fields(with_frames=with_frames)
         found_ns, known = -1, dict[str, Any]()
         # The keyframe of a part has the state; what is missing there is searched for in the parts before.
@@ -140,6 +143,10 @@ class SessionReader:
                 latest_ns, state = self.file(number).state_at(stamp_ns, missing)
                 found_ns, known = max(found_ns, latest_ns), known | state
         return self.topics.with_messages(Tick(), found_ns, known)
+
+    def _begun(self, stamp_ns: int) -> list[int]:
+        """Numbers of the files that begin at or before a stamp."""
+        return [number for number, file in enumerate(self._run.files) if file.first_ns <= stamp_ns]
 
     def _choose_fields(self, *, with_frames: bool) -> set[str]:
         return {field for field in self.topics.by_field if with_frames or field != "frame"}
@@ -192,6 +199,16 @@ class SessionReader:
             for stamp_ns in file.stamps(field)
             if stamp_ns > keyframe_ns
         ]
+
+    def frame(self, number: int) -> Frame:
+        """A recorded image by its number, from 0."""
+        frame = self.file(0).frame(number) if len(self._run.files) == 1 else None
+        return self.frame_at(self.frame_stamps[number]) if frame is None else frame
+
+    @property
+    def frame_count(self) -> int:
+        """Number of recorded images."""
+        return self.counts.get("frame", 0) if len(self._run.files) == 1 else len(self.frame_stamps)
 
     def frame_at(self, stamp_ns: int) -> Frame:
         """The image of the tick with this stamp, one of `frame_stamps`; SessionError if it is damaged."""
@@ -254,7 +271,7 @@ class Frames(Sequence[Frame]):
 
     def __init__(self, reader: SessionReader, which: range | None = None) -> None:
         self._reader = reader
-        self._which = which if which is not None else range(len(reader.frame_stamps))
+        self._which = which if which is not None else range(reader.frame_count)
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -280,14 +297,14 @@ class Frames(Sequence[Frame]):
             number = self._which[operator.index(place)]
         except IndexError:
             raise IndexError(f"frame {place} of {len(self)} in {self._reader.path}") from None
-        return self._reader.frame_at(self._reader.frame_stamps[number])
+        return self._reader.frame(number)
 
     def __iter__(self) -> Iterator[Frame]:
-        if len(self._which) == len(self._reader.frame_stamps) and self._which.step == 1:
+        if len(self._which) == self._reader.frame_count and self._which.step == 1:
             yield from self._reader.messages("frame")
         else:
             for number in self._which:
-                yield self._reader.frame_at(self._reader.frame_stamps[number])
+                yield self._reader.frame(number)
 
     def __repr__(self) -> str:
         return f"<{len(self)} images of {self._reader.path}>"

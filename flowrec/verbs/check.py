@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flowrec.core import FlowrecError
-from flowrec.store import session_path
+from flowrec.store import is_there, part_number, run_files, session_path, size_of
 from flowrec.verbs.command import verb
 from flowrec.verbs.options import BAR, AnySession, Asked, Bar
 
@@ -56,12 +56,18 @@ def check(
     SessionError : it is no session that this flowrec can read; the text says what it is.
     Ended : Ctrl-C or a signal; its `result` is the verdict on what had been read.
     """
-    from flowrec.store import size_of
-    from flowrec.verbs.check_run import check_session, files_to_check
-
     path = session_path(session) if isinstance(session, Path | str) else session.path
-    files = files_to_check(path)
+    files = _files_to_check(path)
     nbytes = sum(map(size_of, files))
+    from flowrec.verbs.check_run import check_session  # which takes a second, after a missing file is refused
+
     told = progress or (lambda _: None)
     with nullcontext(told) if bar is None else bar(f"reading {path.name}", max(nbytes, 1), "bytes") as done:
         return check_session(path, files, done, signers)
+
+
+def _files_to_check(path: Path) -> list[Path]:
+    """The file of that name or, if there is none, the existing parts of that run, finished or not."""
+    if is_there(path):
+        return [path]
+    return sorted(filter(part_number, run_files(path)), key=part_number) or [path]

@@ -18,22 +18,13 @@ from flowrec.store import (
     UrlPath,
     continuity_fault,
     is_continued,
-    is_there,
     part_number,
     part_path,
-    run_files,
     size_of,
     verify_file,
 )
 from flowrec.verbs.check_file import EXACT, HEAD, NOT_EXACT, FileCheck
 from flowrec.verbs.verdict import CONSISTENT, DAMAGED, CheckFinding, Gap, Verdict
-
-
-def files_to_check(path: Path) -> list[Path]:
-    """The file of that name or, if there is none, the existing parts of that run, finished or not."""
-    if is_there(path):
-        return [path]
-    return sorted(filter(part_number, run_files(path)), key=part_number) or [path]
 
 
 def check_session(

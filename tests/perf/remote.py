@@ -2,11 +2,11 @@
 
     python -m tests.perf.remote [SESSION] [--latency 0.05] [--gb 10]
 
-80 MB, 15 s of 640 x 512 at 30 Hz, 50 ms a request, server and reader on the same two cores: opened by 2 requests in one
-round trip and 0.11 s; one second of ticks by 19 in 4, 0.9 MB; all poses by 73 in 5 and 0.5 s; all of it by 171 in 6 and
-1.0 s. Without a session: sparse ones of 10 GB (large.py). 2448 x 2048 at 60 Hz, whose index fits into the last 256 KiB:
-opened by 2 requests in one round trip, a second of ticks by 9 in 4, 0.5 MB; 640 x 512 at 100 Hz, whose index has
-0.8 MB: opened by 3 in 2, a second of ticks by 9 in 4, 1.1 MB.
+128 MB, 12.5 s of 640 x 512 at 60 Hz, 50 ms a request, server and reader on the same two cores: opened by 3 requests in
+two round trips, 0.7 MB; one second of ticks by 19 in 4, 1.2 MB; one image by 4 in 3, 0.8 MB; all poses by 67 in 7 and
+0.7 s; all of it by 244 in 57 and 4 s. Without a session: sparse ones of 10 GB (large.py). 2448 x 2048 at 60 Hz, whose
+index fits into the last 256 KiB: opened by 2 requests in one round trip, a second of ticks by 9 in 3, 0.5 MB; 640 x 512
+at 100 Hz, whose index has 0.8 MB: opened by 3 in 2, a second of ticks by 10 in 4, 1.1 MB.
 """
 
 from __future__ import annotations

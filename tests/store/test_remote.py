@@ -83,6 +83,21 @@ def test_a_second_of_ticks_is_fetched_alone(server: RangeServer, session: Path) 
     assert len(server.requests) == len(set(server.requests))  # nothing is asked for twice
 
 
+def test_each_image_is_that_of_its_number_and_one_alone_is_fetched_with_its_chunk(
+    server: RangeServer, session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near = flowrec.open(session)
+    frames = near.frames
+    for number, (frame, stamp_ns) in enumerate(zip(near.messages("frame"), near.reader.frame_stamps, strict=True)):
+        assert frames[number].same_as(frame) and frame.stamp_ns == stamp_ns
+    assert frames[-1].same_as(frame) and len(frames) == number + 1
+    monkeypatch.setattr(remote_file, "_END_BYTES", 128 << 10)
+    assert flowrec.open(server.url).frames[number // 2].same_as(frames[number // 2])
+    assert len(server.requests) <= 4
+    with pytest.raises(IndexError, match=f"frame {number + 1} of {number + 1}"):
+        frames[number + 1]
+
+
 FAULTS = {
     "refused": (status(403), r"refuses access \(403\); check the credentials in the environment"),
     "missing": (status(404), r"is not there \(404\)"),
