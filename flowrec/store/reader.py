@@ -115,7 +115,7 @@ class SessionReader:
         """
         wanted, tick = self._choose_fields(with_frames=with_frames), Tick()
         if start_ns is not None:
-            self.file(max(self._begun(start_ns), default=0)).announce(start_ns, wanted)
+            self.file(max(self._numbers_until(start_ns), default=0)).announce(start_ns, wanted)
             tick = self.tick_before(start_ns - 1, with_frames=with_frames)
         for number, file in enumerate(self._run.files):
             if start_ns is not None and file.last_ns < start_ns:
@@ -133,7 +133,7 @@ class SessionReader:
         `tick_before(start_ns - 1)` holds the same objects as the state from which `ticks(start_ns)` starts, so that a
         message of its first tick is new if and only if it is another object.
         """
-        begun = self._begun(stamp_ns)
+        begun = self._numbers_until(stamp_ns)
         wanted = self._choose_fields(with_frames=with_frames)
         found_ns, known = -1, dict[str, Any]()
         # The keyframe of a part has the state; what is missing there is searched for in the parts before.
@@ -144,7 +144,7 @@ class SessionReader:
                 found_ns, known = max(found_ns, latest_ns), known | state
         return self.topics.with_messages(Tick(), found_ns, known)
 
-    def _begun(self, stamp_ns: int) -> list[int]:
+    def _numbers_until(self, stamp_ns: int) -> list[int]:
         """Numbers of the files that begin at or before a stamp."""
         return [number for number, file in enumerate(self._run.files) if file.first_ns <= stamp_ns]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flowrec.core import FlowrecError
-from flowrec.store import is_there, part_number, run_files, session_path, size_of
+from flowrec.store import session_path
 from flowrec.verbs.command import verb
 from flowrec.verbs.options import BAR, AnySession, Asked, Bar
 
@@ -56,6 +56,8 @@ def check(
     SessionError : it is no session that this flowrec can read; the text says what it is.
     Ended : Ctrl-C or a signal; its `result` is the verdict on what had been read.
     """
+    from flowrec.store import size_of
+
     path = session_path(session) if isinstance(session, Path | str) else session.path
     files = _files_to_check(path)
     nbytes = sum(map(size_of, files))
@@ -68,6 +70,8 @@ def check(
 
 def _files_to_check(path: Path) -> list[Path]:
     """The file of that name or, if there is none, the existing parts of that run, finished or not."""
+    from flowrec.store import is_there, part_number, run_files
+
     if is_there(path):
         return [path]
     return sorted(filter(part_number, run_files(path)), key=part_number) or [path]
