@@ -10,7 +10,6 @@ import itertools
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -130,7 +129,8 @@ class FileReader(SessionContents):
         """Chunks with images, in order of time, and the number of the first image of each."""
         chunks = sorted(self._chunks_with(self._frame_channels), key=_in_time)
         counts = [lone_count(chunk) for chunk in chunks]
-        if None in counts or any(now.message_start_time <= was.message_end_time for was, now in pairwise(chunks)):
+        overlap = any(now.message_start_time <= was.message_end_time for was, now in itertools.pairwise(chunks))
+        if overlap or None in counts:
             return None
         *firsts, total = itertools.accumulate((count or 0 for count in counts), initial=0)
         announced = sum(self.statistics.channel_message_counts.get(channel, 0) for channel in self._frame_channels)

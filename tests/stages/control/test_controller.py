@@ -253,6 +253,13 @@ def test_the_predicted_position_is_where_the_demands_that_are_on_their_way_take_
     np.testing.assert_allclose(found, expected, atol=0.05)
 
 
+def test_before_the_first_demand_acts_the_map_and_its_correction_alone_move_the_robot():
+    mapped = field_of(lambda x, y: (0.0 * x, 300.0 + 0.0 * x))
+    flow = CorrectedFlow(mapped, np.array([10.0, 0.0]))
+    found = predict_position(CENTRE_UM, np.array([[100.0, 0.0]]), 0.04, 0.2, flow) - CENTRE_UM
+    np.testing.assert_allclose(found, [0.2 * 10.0 + 0.04 * 100.0, 0.2 * 300.0], atol=0.01)
+
+
 @pytest.mark.parametrize(("stated_um_s", "least", "most"), [(3.0, 0.1, 0.5), (90.0, 0.7, 1.0)])
 def test_an_observer_is_believed_by_what_the_map_states_of_itself(stated_um_s, least, most):
     steady = field_of(lambda x, y: (0.0 * x, 300.0 + 0.0 * x))
