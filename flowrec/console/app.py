@@ -21,9 +21,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from flowrec.console.access import Access
 from flowrec.console.board import MOST_PAGES, NOTHING, Board
-from flowrec.console.console import GOAL, SPEED
 from flowrec.console.rerun_viewer import RerunViewer
-from flowrec.run import COMMANDS, LONGEST_NOTE, NOTE
+from flowrec.run import COMMANDS, GOAL, LONGEST_NOTE, NOTE, SPEED
 
 _PERIOD_S = 0.1  # from one state to the next of a page
 _FROZEN_S = 30.0  # a page that takes nothing for so long is let go

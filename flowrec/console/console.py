@@ -2,7 +2,7 @@
 
 Its server is a process of its own (server.py), fed with ticks as the live view is, so the run waits neither for it nor
 for a browser. What an operator asks there comes back through a pipe, as words and numbers and never as objects, and
-becomes an event of the run's control, as a key does.
+becomes an event of the run's control, as a key does: in the run's own process, or through its socket.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
-from flowrec.core import FlowrecError, UsageError
-from flowrec.run import COMMANDS, RunControl
+from flowrec.core import UsageError
 from flowrec.view import Feed, FeedSink, Scene, viewer
 
 PACKAGES = ("starlette", "uvicorn", "websockets")  # of the extra `console`
-GOAL, SPEED = "goal", "speed"  # commands with numbers
 _SERVER = "flowrec.console.server"
 _MAX_HZ = 10.0
 _START_S = 30.0
@@ -74,10 +72,11 @@ def refuse_without_packages() -> None:
 
 
 class Console(FeedSink):
-    """A sink that shows the run on a page, and hands what is asked there to `control`.
+    """A sink that shows the run on a page, and hands what is asked there to the run.
 
     Parameters
     ----------
+    obey : gives the words of a command to the run and returns why it does not take it; called in another thread.
     name : of the session's file.
     rerun_port : of Rerun's server on this machine; None without one.
     remarks : asked some times per second, in another thread.
@@ -91,7 +90,7 @@ class Console(FeedSink):
 
     def __init__(
         self,
-        control: RunControl,
+        obey: Callable[[dict[str, Any]], str],
         scene: Scene,
         name: str,
         rerun_port: int | None = None,
@@ -102,7 +101,7 @@ class Console(FeedSink):
 
         super().__init__()
         self.port = 0
-        self._control, self._tell = control, tell
+        self._obey, self._tell = obey, tell
         self._token = secrets.token_urlsafe(32)
         self._accepts = threading.Event()
         self.message = f"no console: its server did not start within {_START_S:g} s; {_WITHOUT}"
@@ -142,7 +141,10 @@ class Console(FeedSink):
                     self.message = f"console: {self.url}"
                     self._accepts.set()
                 else:
-                    feed.tell(CommandReply(words["ticket"], self._do(words)))
+                    refusal = self._obey(words)
+                    feed.tell(CommandReply(words["ticket"], refusal))
+                    if refusal:
+                        self._tell(f"console: {refusal}")
         if feed.closing:
             return
         feed.process.wait()
@@ -150,21 +152,3 @@ class Console(FeedSink):
         if self._accepts.is_set():
             self._tell(self.message)
         self._accepts.set()
-
-    def _do(self, words: dict[str, Any]) -> str:
-        """Give a command to the run; why it does not take it, '' where it does."""
-        name, taken = words["command"], True
-        if name in (GOAL, SPEED) and self._control.reason:
-            return f"the run ends: {self._control.reason}"
-        try:
-            if name == GOAL:
-                self._control.set_goal(float(words["x_um"]), float(words["y_um"]))
-            elif name == SPEED:
-                limit = words["limit_um_s"]
-                self._control.limit_speed(None if limit is None else float(limit))
-            else:
-                taken = COMMANDS[name].give(self._control, words["text"], "console") is not False
-        except FlowrecError as error:  # a place or speed that no run could have
-            self._tell(f"console: {error}")
-            return str(error)
-        return "" if taken else "too many commands wait for their tick; give it again"

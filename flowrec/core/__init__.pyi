@@ -94,7 +94,9 @@ from .system.processes import (
     prioritise_thread as prioritise_thread, realtime_priority as realtime_priority,
     start_child as start_child,
 )
-from .system.regular_file import refuse_irregular as refuse_irregular
+from .system.regular_file import (
+    make_own_folder as make_own_folder, refuse_irregular as refuse_irregular, user_id as user_id,
+)
 from .system.stderr import said_within as said_within
 from .system.table_file import DATES as DATES, TIME_UNITS as TIME_UNITS, Table as Table, read_table as read_table
 from .system.toml_file import parse_toml as parse_toml, read_toml as read_toml

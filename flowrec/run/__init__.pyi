@@ -3,8 +3,12 @@ import sys
 from .control import RunControl as RunControl
 from .disk_monitor import DiskMonitor as DiskMonitor, refuse_below as refuse_below
 from .loop import RunReport as RunReport, Sink as Sink, run as run
-from .operator_commands import COMMANDS as COMMANDS, HELP as HELP, LONGEST_NOTE as LONGEST_NOTE, NOTE as NOTE
+from .operator_commands import (
+    COMMANDS as COMMANDS, GOAL as GOAL, HELP as HELP, LONGEST_NOTE as LONGEST_NOTE, NOTE as NOTE, SPEED as SPEED,
+    obey as obey,
+)
 from .recorded import RecordedRig as RecordedRig
+from .remote_control import CommandSocket as CommandSocket, RemoteControl as RemoteControl
 from .replay_figures import (
     CommandDifference as CommandDifference, ReplayFiles as ReplayFiles, ReplayPair as ReplayPair,
     before_after as before_after,

@@ -1,15 +1,20 @@
-"""Commands of an operator to a run: one table for the keys of the terminal and the buttons of the console."""
+"""Commands of an operator to a run: one table for the keys of the terminal and the buttons of the console.
+
+What comes from another process comes as words and numbers (`obey`), never as objects.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
-from flowrec.core import Action
+from flowrec.core import Action, FlowrecError
 from flowrec.run.control import LONGEST_TEXT, RunControl
 
 LONGEST_NOTE = LONGEST_TEXT
 NOTE = "note"  # the command with a text
+GOAL, SPEED = "goal", "speed"  # commands with numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,3 +85,29 @@ COMMANDS = {
 }
 BY_KEY = {row.key: row for row in COMMANDS.values()}
 HELP = "keys: " + "   ".join(f"{'space' if row.key == ' ' else row.key} {row.words}" for row in COMMANDS.values())
+
+
+def obey(control: RunControl, words: dict[str, Any]) -> str:
+    """Give a command of the console to the run; why it does not take it, '' where it does.
+
+    Parameters
+    ----------
+    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), or `text`.
+    """
+    try:
+        name = words["command"]
+        if name in (GOAL, SPEED) and control.reason:
+            return f"the run ends: {control.reason}"
+        taken: bool | None = True
+        if name == GOAL:
+            control.set_goal(float(words["x_um"]), float(words["y_um"]))
+        elif name == SPEED:
+            limit = words["limit_um_s"]
+            control.limit_speed(None if limit is None else float(limit))
+        else:
+            taken = COMMANDS[name].give(control, str(words["text"]), "console")
+    except FlowrecError as error:  # a place or speed that no run could have
+        return str(error)
+    except (KeyError, TypeError, ValueError) as error:
+        return f"not understood: {error!r}"
+    return "too many commands wait for their tick; give it again" if taken is False else ""

@@ -30,6 +30,7 @@ from flowrec.core import (
 )
 from flowrec.rigs import Connecting, MovieRig, Picturing, Rig
 from flowrec.run import (
+    CommandSocket,
     DiskMonitor,
     LockstepWorker,
     Preloaded,
@@ -40,6 +41,7 @@ from flowrec.run import (
     Streams,
     Watchdog,
     Worker,
+    obey,
     run,
 )
 from flowrec.stages import (
@@ -222,6 +224,7 @@ class _Mission:
 
         disk = DiskMonitor(self._folder, lambda: writer.bytes_written, floor_gb, disk_low)
         self._disk = stack.enter_context(disk.running())
+        stack.enter_context(CommandSocket(self._output.path, run_control, warn))
 
     def watching(self, view: View, console: bool) -> Watching:
         """Displays of the run."""
@@ -229,7 +232,7 @@ class _Mission:
         return Watching(
             view,
             (self._config, self._chip, self._output.path),
-            self.run_control if console else None,
+            partial(obey, self.run_control) if console else None,
             lambda: {"disk": disk.text, "file_mb": writer.bytes_written / 1e6, "duration_s": duration_s},
         )
 

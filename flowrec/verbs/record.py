@@ -75,7 +75,11 @@ def record(
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig.")] = None,
     sets: Sets = None,
     console: Annotated[
-        bool, typer.Option("--console", help="Serve a page on this machine: buttons, goal by a click, large stop.")
+        bool,
+        typer.Option(
+            "--console",
+            help="Serve a page on this machine: buttons, goal by a click, large stop; view --live --console opens it later.",
+        ),
     ] = False,
     duration_s: Annotated[
         float | None, typer.Option("--duration", metavar="S", help="Stop after this many seconds.")

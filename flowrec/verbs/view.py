@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -17,6 +17,7 @@ from flowrec.verbs.options import Overwrite
     "flowrec view a.mcap --screenshot a.png --time 12",
     "flowrec view a.mcap --layout .",
     "flowrec view --live",
+    "flowrec view --live --console",
 )
 def view(
     session: Annotated[
@@ -48,6 +49,10 @@ def view(
     live: Annotated[
         bool, typer.Option("--live", help="Show a run that is being recorded; the only one need not be named.")
     ] = False,
+    console: Annotated[
+        bool,
+        typer.Option("--console", help="With --live: serve the page that steers the run, as record --console does."),
+    ] = False,
     overwrite: Overwrite = False,
 ) -> Told:
     """Write the .rrd of a session and open it in Rerun, or show a run that is being recorded.
@@ -62,8 +67,8 @@ def view(
     from flowrec.view import open_viewer
     from flowrec.view import screenshot as take
 
-    if live:
-        return _watch(session, no_open, (beside, out, screenshot, time, layout))
+    if live or console:
+        return _watch(session, live, "serve" if no_open else "spawn", console, (beside, out, screenshot, time, layout))
     if session is None:
         raise UsageError("SESSION: name a session (.mcap), or --live for a run that is being recorded")
     if session.suffix == ".rrd" and not session.exists():
@@ -98,12 +103,16 @@ def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: 
     return export(opened, out, overwrite, beside=second), []
 
 
-def _watch(session: Path | None, no_open: bool, outputs: Iterable[object]) -> Told:
+def _watch(
+    session: Path | None, live: bool, mode: Literal["spawn", "serve"], console: bool, outputs: Iterable[object]
+) -> Told:
+    if not live:
+        raise UsageError("--console: steers a run that is being recorded; say --live, too")
     if any(value is not None for value in outputs):
         raise UsageError("--live: shows a run that is being recorded, and writes no file")
     from flowrec.verbs.watching import watch
 
-    return Told(after=lambda: watch(session, "serve" if no_open else "spawn"))
+    return Told(after=lambda: watch(session, mode, console=console))
 
 
 def _write_layouts(session: Path, folder: Path, overwrite: bool) -> Told:

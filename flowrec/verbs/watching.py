@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from flowrec.console import Console, RunEnded
+from flowrec.console import Console, RunEnded, refuse_without_packages
 from flowrec.core import FlowrecError, UsageError, View, say, seconds
 from flowrec.physics import Chip
-from flowrec.run import RunControl, Sink
+from flowrec.run import RemoteControl, Sink
 from flowrec.stages import ResolvedConfig
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class Watching:
         self,
         view: View,
         scene: tuple[ResolvedConfig, Chip, Path],
-        control: RunControl | None,
+        obey: Callable[[dict[str, Any]], str] | None,
         remarks: Callable[[], dict[str, Any]],
     ) -> None:
         """Start what is asked for.
@@ -35,13 +35,13 @@ class Watching:
         Parameters
         ----------
         scene : settings and chip of the run, and the path of its session.
-        control : what the console steers; None: no console.
+        obey : takes the commands of the console; None: there is no console.
         remarks : what the console shows besides ticks; asked in another thread.
         """
         self._live: LiveView | None = None
         self._console: Console | None = None
         live = view in ("spawn", "serve")
-        if not live and control is None:
+        if not live and obey is None:
             return
         # Imported here because importing Rerun takes a second and most runs do not need it.
         from flowrec.exports import scene_of
@@ -51,11 +51,11 @@ class Watching:
         self._live = LiveView(shown, "spawn" if view == "spawn" else "serve")
         if live:
             say(self._live.message)
-        if control is not None:
+        if obey is not None:
             camera = scene[0].camera
             shown = replace(shown, image_px=(camera.width_px, camera.height_px))
             port = self._live.port if self._live.pid is not None else None
-            self._console = Console(control, shown, scene[2].name, port, remarks, say)
+            self._console = Console(obey, shown, scene[2].name, port, remarks, say)
             say(self._console.message)
             if self._console.tunnel:
                 say(self._console.tunnel)
@@ -83,18 +83,23 @@ class Watching:
         self.close(RunEnded(f"failed: {error}" if isinstance(error, FlowrecError) else "failed"))
 
 
-def watch(path: Path | None, mode: Literal["spawn", "serve"]) -> None:
+def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool = False) -> None:
     """Show a run that another process records, from the beginning of its file until it ends or Ctrl-C.
+
+    Parameters
+    ----------
+    console : serve a page that steers it, too.
 
     Raises
     ------
-    UsageError : no run is named, and there is not exactly one.
+    UsageError : no run is named, and there is not exactly one; a package of the console is missing.
     SessionError : it is not being recorded, or its file is damaged.
+    FlowrecError : it takes no commands from here.
     """
-    from flowrec.exports import scene_of
     from flowrec.store import GrowingRun, live_runs
-    from flowrec.view import LiveView
 
+    if console:
+        refuse_without_packages()
     if path is None:
         runs = live_runs()
         if len(runs) != 1:
@@ -102,14 +107,19 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"]) -> None:
             raise UsageError(f"--live: {len(runs) or 'no'} runs are being recorded{there}")
         path = runs[0].path
     run = GrowingRun(path)
-    scene = scene_of(run.config, run.chip, run.path)
+    obey = RemoteControl(run.path).obey if console else None
+    remarks = {"duration_s": run.config.duration_s}
     last_ns = 0
-    with LiveView(scene, mode) as shown:
+    ended = RunEnded("this page was closed; the run goes on", good=True)
+    shown = Watching(mode, (run.config, run.chip, run.path), obey, lambda: remarks)
+    try:
         say(f"{run.path}: Ctrl-C ends the view, not the run")
-        say(shown.message)
         for tick in run.ticks():
-            shown.write(tick)
+            for sink in shown.sinks:
+                sink.write(tick)
             last_ns = tick.stamp_ns
-    say(f"{run.path}: the run has ended at {seconds(last_ns):.1f} s")
-    if shown.afterwards:
-        say(shown.afterwards)
+        text = f"the run has ended at {seconds(last_ns):.1f} s"
+        ended = RunEnded(text, str(run.path), good=True)
+        say(f"{run.path}: {text}")
+    finally:
+        shown.close(ended)

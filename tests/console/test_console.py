@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from flowrec.core.errors import UsageError
 from flowrec.core.messages import Event, FlowField, OperatorEvent
 from flowrec.core.topics import Tick
 from flowrec.run.control import RunControl
-from flowrec.run.operator_commands import COMMANDS
+from flowrec.run.operator_commands import COMMANDS, obey
 from flowrec.view.feed import Batch
 from flowrec.view.live import LiveView
 from flowrec.view.scene import Scene
@@ -67,7 +68,9 @@ class Served:
 
     def __init__(self, scene: Scene, rerun_port: int | None = None) -> None:
         self.control, self.told = RunControl(), list[str]()
-        self.console = console_module.Console(self.control, scene, "a.mcap", rerun_port, dict, self.told.append)
+        self.console = console_module.Console(
+            partial(obey, self.control), scene, "a.mcap", rerun_port, dict, self.told.append
+        )
         self.host = f"127.0.0.1:{self.console.port}"
         self.token = self.console.url.partition("=")[2]
         self.cookie = f"flowrec_console_{self.console.port}={self.token}"

@@ -14,7 +14,6 @@ import functools
 import hashlib
 import os
 import shutil
-import stat
 import sys
 import tempfile
 import time
@@ -22,6 +21,8 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
+
+from flowrec.core.system.regular_file import make_own_folder, user_id
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -105,10 +106,7 @@ def _cache_folder() -> str:
         with contextlib.suppress(OSError):
             if not folder.exists():
                 _remove_unused(place)
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            found = folder.lstat()
-            if not stat.S_ISDIR(found.st_mode) or found.st_uid != _user_id() or found.st_mode & 0o022:
-                continue  # another user could write code there that this process runs
+            make_own_folder(folder)  # else another user could write code there that this process runs
             tempfile.TemporaryFile(dir=folder).close()
             os.utime(folder)
             return str(folder)
@@ -124,15 +122,7 @@ def _places() -> Iterator[Path]:
         home = os.path.expanduser("~/.cache")  # noqa: PTH111 - which raises nothing where there is no home
     if os.path.isabs(home):  # noqa: PTH117
         yield Path(home, "flowrec")
-    yield Path(tempfile.gettempdir(), f"flowrec-{_user_id()}")
-
-
-def _user_id() -> int:
-    """Number of the user; 0 on Windows, where files have none."""
-    number = 0
-    if sys.platform != "win32":
-        number = os.getuid()
-    return number
+    yield Path(tempfile.gettempdir(), f"flowrec-{user_id()}")
 
 
 def _remove_unused(place: Path) -> None:
