@@ -78,7 +78,7 @@ def record(
         bool,
         typer.Option(
             "--console",
-            help="Serve a page on this machine: buttons, goal by a click, large stop; view --live --console opens it later.",
+            help="Serve a page on this machine: buttons, goal by a click, large stop; view --live --console adds it.",
         ),
     ] = False,
     duration_s: Annotated[

@@ -5,7 +5,6 @@ from __future__ import annotations
 import stat
 import sys
 import threading
-from collections.abc import Iterator
 from multiprocessing.connection import Client
 from pathlib import Path
 
@@ -21,10 +20,10 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the folder of t
 
 
 @pytest.fixture
-def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A short folder of temporary files: the path of a socket has 108 characters at most."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    yield tmp_path
+    return tmp_path
 
 
 def test_commands_of_another_process_become_events_and_are_refused_as_those_of_the_page(places: Path) -> None:

@@ -13,6 +13,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from flowrec.core.errors import SessionError, UsageError
+from flowrec.run.control import RunControl
+from flowrec.run.remote_control import CommandSocket
 from flowrec.store.notes import notes_file
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
@@ -74,6 +76,7 @@ def test_a_run_that_is_going_on_is_listed_as_such(tmp_path: Path) -> None:
 @pytest.mark.slow("two runs in real time")
 @pytest.mark.skipif(sys.platform == "win32", reason="descriptors are inherited by POSIX processes only")
 def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_path: Path) -> None:
+    connect = pytest.importorskip("websockets.sync.client").connect
     path = tmp_path / "x.mcap"
     recorded = SessionReader(session)
     with SessionWriter(path, recorded.header, WriterOptions(own_process=True, block=True, flush_s=0.05)) as writer:
@@ -81,11 +84,27 @@ def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_pat
             writer.write(tick)
         shown = typed("ls", "--live").stdout
         assert "x.mcap.partial" in shown and "recording" in shown
-        words = [sys.executable, "-m", "flowrec", "view", path, "--live", "--no-open"]
-        with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as view:
+        words = [sys.executable, "-m", "flowrec", "view", path, "--live", "--console", "--no-open"]
+        control = RunControl()
+        with (
+            CommandSocket(path, control, print),
+            subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as view,
+        ):
             assert view.stderr is not None
-            told = [view.stderr.readline() for _ in range(2)]
-            assert "Ctrl-C ends the view" in told[0] and "rerun --connect" in told[1]
+            told = [view.stderr.readline() for _ in range(4)]
+            assert "rerun --connect" in told[0] and "Ctrl-C ends the view" in told[3]
+            port, token = told[1].strip().rpartition("127.0.0.1:")[2].split("/?token=")
+            with connect(
+                f"ws://127.0.0.1:{port}/live",
+                origin=f"http://127.0.0.1:{port}",
+                additional_headers={"Cookie": f"flowrec_console_{port}={token}"},
+                proxy=None,
+            ) as page:
+                page.send(json.dumps({"number": 7, "command": "hold"}))
+                answers = (json.loads(word) for word in page if isinstance(word, str))
+                assert next(word for word in answers if "answers" in word) == {"answers": 7, "refusal": ""}
+                event = control.next_event(10**9, held=False)
+                assert event is not None and event.action == "pause"
             writer.close()
             last = view.stderr.read()
     assert view.returncode == 0 and f"the run has ended at {tick.stamp_ns / 1e9:.1f} s" in last
@@ -93,6 +112,8 @@ def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_pat
         typed("view", path, "--live")
     with pytest.raises(UsageError, match="name a session"):
         view_session(None)
+    with pytest.raises(UsageError, match="say --live"):
+        view_session(None, console=True)
     with pytest.raises(UsageError, match="writes no file"):
         view_session(None, live=True, out=tmp_path / "x.rrd")
 
