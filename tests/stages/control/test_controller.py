@@ -7,6 +7,8 @@ from flowrec.core.messages import Demand, Estimate, Route
 from flowrec.physics.chip.clearance import clearance_um
 from flowrec.stages.control import Controller
 from flowrec.stages.control.delay_compensation import CorrectedFlow, corrected_flow, predict_position
+from flowrec.stages.control.tracking_laws import Situation
+from flowrec.stages.control.wall_barrier import wall_barrier
 from tests.stages.control.plant import CENTRE_UM, ROBOT, field_of, fly, lemniscate, mission, straight, vortex
 
 UNGOVERNED = {"lag_free_radii": 1e9, "lag_full_radii": 2e9}  # the paper's reference does not wait
@@ -162,6 +164,27 @@ def test_the_wall_guard_keeps_the_robot_off_the_wall_that_its_route_leads_into()
     ]
     nearest = [run.position_um[:, 1].min() - wall_um for run in runs]
     assert nearest[0] > 0.9 * ROBOT.radius_um and nearest[1] < 0.0
+
+
+def test_the_clearance_that_is_kept_is_that_of_the_narrowest_place_of_the_route_near_the_robot():
+    """A wall along y = 0: of any set of waypoints near the robot the one nearest to the wall gives the clearance."""
+    um_per_px, keep_um, rng = 10.0, 300.0, np.random.default_rng(0)
+    clearance = np.repeat(um_per_px * np.arange(101, dtype=np.float32)[:, None], 101, axis=1)
+    robot = replace(ROBOT, radius_um=100.0)
+    at_um, down = np.array([500.0, 320.0]), np.array([0.0, -1e4])
+    for far in (False, True):
+        for count in (2, 5, 16):
+            waypoints_um = np.stack([500.0 + rng.uniform(-50, 50, count), rng.uniform(120.0, 400.0, count)], -1)
+            least_um = waypoints_um[:, 1].min()
+            if far:  # one beyond four radii, which does not count
+                waypoints_um = np.vstack([waypoints_um, [950.0, 110.0]])
+            route = Route(0, 1, "", True, "", waypoints_um, np.arange(float(len(waypoints_um))))
+            now = Situation(
+                *(None, mission("navigate"), route, seen_at(at_um), None, CorrectedFlow(None, np.zeros(2)), robot),
+                *(at_um, 1e6, 0.04, um_per_px),
+            )
+            guarded, _ = wall_barrier(down, now, clearance, keep_um, 2.0)
+            assert -guarded[1] == pytest.approx(2.0 * (at_um[1] - min(least_um, keep_um)), rel=1e-5), (far, count)
 
 
 def test_a_demand_that_the_law_or_the_wall_guard_asks_beyond_the_speed_limit_is_saturated():
