@@ -195,6 +195,9 @@ def catalog(
     port: Annotated[
         int | None, typer.Option(metavar="PORT", min=1, max=65535, help="With --serve; by default a free one.")
     ] = None,
+    jobs: Annotated[
+        int, typer.Option(metavar="N", min=0, max=64, help="Processes that read sessions; 0: one a core.")
+    ] = 1,
 ) -> "Refreshed":
     """Write one table about all sessions of some places, which find searches; only what has changed is read again."""
     if not serve and (where or port is not None):
@@ -203,7 +206,7 @@ def catalog(
     from flowrec.core import progress
 
     with progress("reading sessions", 1.0) as done:
-        return refresh(places or (), out, done)
+        return refresh(places or (), out, done, jobs)
 
 
 def _find_told(asked: Asked, found: "FoundSessions") -> Told:

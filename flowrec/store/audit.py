@@ -87,7 +87,7 @@ class Audit:
         """The file as run_files.py compares it with others."""
         part = self.header.part if self.header is not None else None
         counts = {self.topics.by_field[name].path: count for name, count in self.counts.items()}
-        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.size_bytes)
+        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.size_bytes, None)
 
 
 def audit(

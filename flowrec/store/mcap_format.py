@@ -6,6 +6,7 @@ Layout: https://mcap.dev/spec.
 
 from __future__ import annotations
 
+import functools
 import io
 import struct
 from collections.abc import Iterator, Mapping
@@ -44,6 +45,7 @@ CHUNK_LIMIT_BYTES = 72 << 20
 MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
 # Of schemas, channels, metadata and attachments together, each of which takes some 20 us. flowrec writes 60.
 DECLARED_LIMIT = 10_000
+_DECLARATIONS_KEPT = 1024
 
 
 class Record(NamedTuple):
@@ -168,7 +170,7 @@ def parse_summary(data: bytes, data_end: int) -> Summary:
             raise ValueError(f"more than {DECLARED_LIMIT} records besides chunks")
         stream = stream_of(data[at : at + length])
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            summary.enter((Schema if opcode == Opcode.SCHEMA else Channel).read(stream), at, length)
+            summary.enter(_declaration(opcode, data[at : at + length]), at, length)
         elif opcode == Opcode.ATTACHMENT_INDEX:
             summary.attachments.append(AttachmentIndex.read(stream))
         elif opcode == Opcode.METADATA_INDEX:
@@ -178,6 +180,12 @@ def parse_summary(data: bytes, data_end: int) -> Summary:
     _check_places(summary, data_end)
     _check_counts(summary)
     return summary
+
+
+@functools.lru_cache(_DECLARATIONS_KEPT)
+def _declaration(opcode: int, body: bytes) -> Schema | Channel:
+    """A schema or channel; nobody changes it, and most sessions of a folder declare the same ones."""
+    return (Schema if opcode == Opcode.SCHEMA else Channel).read(stream_of(body))
 
 
 def lone_count(chunk: ChunkIndex) -> int | None:

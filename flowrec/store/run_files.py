@@ -158,12 +158,13 @@ class RunFile:
     counts: Mapping[str, int]
     outcome: Mapping[str, str]
     size_bytes: int
+    digest: Mapping[str, str] | None
 
     @classmethod
     def of(cls, file: SessionMetadata) -> Self:
         """Description of an open file."""
         times_ns = file.statistics.message_start_time, file.statistics.message_end_time
-        return cls(file.source.path, file.part, *times_ns, file.counts, file.outcome, file.source.size)
+        return cls(file.source.path, file.part, *times_ns, file.counts, file.outcome, file.source.size, file.digest)
 
 
 @dataclass(frozen=True, slots=True)

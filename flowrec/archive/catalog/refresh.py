@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,12 +17,13 @@ from flowrec.archive.catalog.format import EVENTS, NAME, PLACE, SIGNATURE, About
 from flowrec.archive.catalog.places import Found, contents_of
 from flowrec.archive.catalog.sweeps import lists_of, sweep_rows
 from flowrec.archive.sweep.tasks import content_of
-from flowrec.core import Ended, FlowrecError, SessionError, UsageError, __version__, printable, seconds
+from flowrec.core import Ended, FlowrecError, SessionError, UsageError, __version__, pool, printable, seconds
 from flowrec.store import RefusedError, Session, TransientError, UrlPath, session_path
 from flowrec.verbs import TEXT_LIMIT, columns_of, describe, read_each
 
 _BROKEN = ("unreadable", "unfinished", "recording")
 _TEMPORARY = (OSError, TransientError, RefusedError)  # errors of a disk, a network or a server
+_TOGETHER = 32  # sessions that a process is given at a time
 _EVENTS_LIMIT = 10_000  # of a session; no person makes more
 
 
@@ -75,7 +78,10 @@ class Refreshed:
 
 
 def refresh(
-    places: Sequence[Path | str], out: Path | None = None, progress: Callable[[float], None] = lambda _: None
+    places: Sequence[Path | str],
+    out: Path | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+    jobs: int = 1,
 ) -> Refreshed:
     """Write or refresh the catalog of some places.
 
@@ -85,6 +91,7 @@ def refresh(
         folder.
     out : the catalog; by default in the folder, if one is named, or in this one.
     progress : takes the share of the work that is done.
+    jobs : processes that read the sessions of this machine; 0: one for each core.
 
     Raises
     ------
@@ -110,7 +117,7 @@ def refresh(
         places_before, signatures = (known.sessions[name].to_pylist() for name in (PLACE, SIGNATURE))
         before = dict(zip(map(os.fsdecode, places_before), signatures, strict=True))
         due = {text: each for text, each in named.items() if before.get(text) != each.signature}
-        rows, stop_status = _read(due, progress)
+        rows, stop_status = _read(due, progress, jobs or os.cpu_count() or 1)
         left = len(due) - len(rows)
         read = {os.fsdecode(row[PLACE]) for row in rows}
         # A changed session that was not read before an interruption is left out: what is known of it is out of date.
@@ -154,16 +161,23 @@ def _empty_error(places: Sequence[Path], known: int) -> SessionError | UsageErro
     return UsageError(f"{where}: no session (.mcap) is there, nor in a folder below; name directories and sessions")
 
 
-def _read(due: dict[str, Found], progress: Callable[[float], None]) -> tuple[list[dict[str, Any]], int]:
+def _read(due: dict[str, Found], progress: Callable[[float], None], jobs: int) -> tuple[list[dict[str, Any]], int]:
     """The rows of sessions, and the exit status of an interruption before all were read; 0 without one."""
     rows: list[dict[str, Any]] = []
     stop_status = 0
     try:
-        far = any(isinstance(found.path, UrlPath) for found in due.values())
-        with read_each(lambda text: row_of(due[text], text), due, far) as read:
+        with ExitStack() as stack:
+            far = any(isinstance(found.path, UrlPath) for found in due.values())
+            if far or jobs == 1:
+                read = stack.enter_context(read_each(lambda text: row_of(due[text], text), due, far))
+            else:
+                executor = stack.enter_context(pool(jobs))
+                read = executor.map(row_of, due.values(), due, chunksize=_TOGETHER)
             for row in read:
                 rows.append(row)
                 progress(len(rows) / len(due))
+    except BrokenProcessPool as error:
+        raise SessionError("a process that read sessions was killed; try fewer --jobs") from error
     except KeyboardInterrupt as error:
         if not rows:
             raise

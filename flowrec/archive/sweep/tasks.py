@@ -6,7 +6,7 @@ import glob
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,6 @@ from flowrec.core import NUMERICS_VERSION, REPLAYED, SessionError, UsageError, _
 from flowrec.store import (
     SESSION_SUFFIX,
     Session,
-    SessionMetadata,
     UrlPath,
     run_files,
     session_path,
@@ -157,10 +156,7 @@ def content_of(session: Session) -> str:
     ------
     SessionError : the session can not be read.
     """
-    digests: list[Mapping[str, str]] = []
-    for file in session.run.files:
-        with SessionMetadata(file.path) as head:
-            digests.append(head.digest or {"file": session_sha256([file.path])})
+    digests = [file.digest or {"file": session_sha256([file.path])} for file in session.run.files]
     return hashlib.sha256(json.dumps([sorted(each.items()) for each in digests]).encode()).hexdigest()[:32]
 
 

@@ -125,6 +125,13 @@ def test_every_session_is_a_row_whatever_its_state_and_is_read_once(
     assert (again.sessions, again.new, again.changed, again.gone, again.broken) == (7, 0, 0, 0, 3)
 
 
+def test_two_processes_write_the_same_rows_as_one(catalogued: Path, tmp_path: Path) -> None:
+    found = refresh.refresh([catalogued], tmp_path / "two.parquet", jobs=2)
+    assert (found.sessions, found.new, found.broken) == (7, 7, 3)
+    one, two = (find(catalog=path).as_json()["sessions"] for path in (catalogued / NAME, tmp_path / "two.parquet"))
+    assert [{**row, "path": row["name"]} for row in one] == [{**row, "path": row["name"]} for row in two]
+
+
 def test_ls_and_find_have_the_same_columns_values_and_answers(catalogued: Path) -> None:
     with open_catalog(catalogued / NAME) as (_, table):
         known = {row["name"]: row for row in table.rows("")[1]}
