@@ -111,8 +111,9 @@ def named_opening(chip: Chip, name: str) -> Opening:
     found = [opening for opening in chip.openings if opening.kind == kind]
     if not found or (number and (not number.isdigit() or int(number) >= len(found))):
         kinds = [opening.kind for opening in chip.openings]
-        counts = ", ".join(f"{kind}:0 to :{kinds.count(kind) - 1}" for kind in sorted(set(kinds)))
-        raise ChipError(f"place {name!r} is not on chip {chip.name!r}; it has {counts}, or give a point as x,y in um")
+        most = {kind: kinds.count(kind) - 1 for kind in sorted(set(kinds))}
+        there = ", ".join(f"{kind}:0 to {kind}:{last}" if last else kind for kind, last in most.items())
+        raise ChipError(f"place {name!r} is not on chip {chip.name!r}; it has {there}, or give a point as x,y in um")
     return found[int(number)] if number else max(found, key=lambda opening: opening.width_px)
 
 
