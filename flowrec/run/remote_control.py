@@ -31,7 +31,7 @@ _BACKLOG = 16
 
 def _address(session: Path) -> str:
     """Address at which the run that records a session takes commands."""
-    name = hashlib.sha256(str(session.resolve()).encode()).hexdigest()[:24]
+    name = hashlib.sha256(str(session.resolve()).encode()).hexdigest()[:16]
     if sys.platform == "win32":
         return rf"\\.\pipe\flowrec-{name}"
     return str(Path(tempfile.gettempdir(), f"flowrec-{user_id()}", "runs", f"{name}.sock"))

@@ -57,6 +57,8 @@ def view(
 ) -> Told:
     """Write the .rrd of a session and open it in Rerun, or show a run that is being recorded.
 
+    Long because its parameters are the options of the verb.
+
     Raises
     ------
     UsageError : outputs that do not go together; no session is named, or with `live` not one of several runs.
