@@ -14,7 +14,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from multiprocessing.connection import Client, Connection, Listener
+from multiprocessing.connection import Client, Listener
 from pathlib import Path
 from typing import Any, Self
 
@@ -32,9 +32,10 @@ _BACKLOG = 16
 def _address(session: Path) -> str:
     """Address at which the run that records a session takes commands."""
     name = hashlib.sha256(str(session.resolve()).encode()).hexdigest()[:16]
+    address = str(Path(tempfile.gettempdir(), f"flowrec-{user_id()}", "runs", f"{name}.sock"))
     if sys.platform == "win32":
-        return rf"\\.\pipe\flowrec-{name}"
-    return str(Path(tempfile.gettempdir(), f"flowrec-{user_id()}", "runs", f"{name}.sock"))
+        address = rf"\\.\pipe\flowrec-{name}"
+    return address
 
 
 class CommandSocket:
@@ -82,7 +83,7 @@ class CommandSocket:
             except (OSError, EOFError):  # the other end has gone; or no descriptor is left, which may pass
                 self._closing.wait(_PAUSE_S)
 
-    def _answer(self, connection: Connection) -> str:
+    def _answer(self, connection: Any) -> str:
         try:
             words = json.loads(connection.recv_bytes(_LONGEST_BYTES))
         except ValueError as error:
@@ -119,7 +120,8 @@ class RemoteControl:
         except FlowrecError as error:
             return str(error)
 
-    def _connection(self) -> Connection:
+    def _connection(self) -> Any:
+        """A `multiprocessing.connection.Connection`; on Windows a PipeConnection."""
         try:
             return Client(_address(self._session))
         except OSError as error:

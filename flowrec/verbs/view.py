@@ -57,12 +57,14 @@ def view(
 ) -> Told:
     """Write the .rrd of a session and open it in Rerun, or show a run that is being recorded.
 
-    Long because its parameters are the options of the verb.
-
     Raises
     ------
     UsageError : outputs that do not go together; no session is named, or with `live` not one of several runs.
     SessionError : the session can not be read, or an output not be written; OutputError if it may not be.
+
+    Notes
+    -----
+    Long because its parameters are the options of the verb.
     """
     from flowrec.core import PICTURE, Output
     from flowrec.store import files_behind
