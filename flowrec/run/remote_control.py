@@ -114,7 +114,7 @@ class RemoteControl:
                 connection.send_bytes(json.dumps(words).encode())
                 if not connection.poll(_ANSWER_S):
                     return f"the run has not answered for {_ANSWER_S:g} s; it may have taken the command"
-                return connection.recv_bytes(_LONGEST_BYTES).decode(errors="replace")
+                return str(connection.recv_bytes(_LONGEST_BYTES), "utf-8", "replace")
         except (OSError, EOFError):
             return "the run has ended, or ends, and takes no command"
         except FlowrecError as error:
