@@ -48,7 +48,8 @@ def package(tmp_path: Path) -> Path:
     """A small copy of flowrec, with a kernel that calls one of another file."""
     copy = tmp_path / "installed" / "flowrec"
     (copy / "core" / "system").mkdir(parents=True)
-    own = ("__init__.py", "__init__.pyi", "version.py", "system/__init__.py", "system/numba_setup.py")
+    system = ("__init__.py", "numba_setup.py", "regular_file.py")
+    own = ("__init__.py", "__init__.pyi", "version.py", "errors.py", *(f"system/{each}" for each in system))
     for name in ("__init__.py", "__init__.pyi", *(f"core/{each}" for each in own)):
         (copy / name).write_bytes((PACKAGE / name).read_bytes())
     (copy / "inner.py").write_text(INNER.format(value=3))
