@@ -95,7 +95,8 @@ from .system.processes import (
     start_child as start_child,
 )
 from .system.regular_file import (
-    make_own_folder as make_own_folder, refuse_irregular as refuse_irregular, user_id as user_id,
+    make_own_folder as make_own_folder, own_temporary_folder as own_temporary_folder,
+    refuse_irregular as refuse_irregular,
 )
 from .system.stderr import said_within as said_within
 from .system.table_file import DATES as DATES, TIME_UNITS as TIME_UNITS, Table as Table, read_table as read_table

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,7 +17,7 @@ from multiprocessing.connection import Client, Listener
 from pathlib import Path
 from typing import Any, Self
 
-from flowrec.core import FlowrecError, make_own_folder, user_id
+from flowrec.core import FlowrecError, make_own_folder, own_temporary_folder
 from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import obey
 
@@ -32,7 +31,7 @@ _BACKLOG = 16
 def _address(session: Path) -> str:
     """Address at which the run that records a session takes commands."""
     name = hashlib.sha256(str(session.resolve()).encode()).hexdigest()[:16]
-    address = str(Path(tempfile.gettempdir(), f"flowrec-{user_id()}", "runs", f"{name}.sock"))
+    address = str(own_temporary_folder() / "runs" / f"{name}.sock")
     if sys.platform == "win32":
         address = rf"\\.\pipe\flowrec-{name}"
     return address

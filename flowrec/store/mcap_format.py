@@ -168,15 +168,15 @@ def parse_summary(data: bytes, data_end: int) -> Summary:
         declared += 1
         if declared > DECLARED_LIMIT:
             raise ValueError(f"more than {DECLARED_LIMIT} records besides chunks")
-        stream = stream_of(data[at : at + length])
+        body = data[at : at + length]
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            summary.enter(_declaration(opcode, data[at : at + length]), at, length)
+            summary.enter(_declaration(opcode, body), at, length)
         elif opcode == Opcode.ATTACHMENT_INDEX:
-            summary.attachments.append(AttachmentIndex.read(stream))
+            summary.attachments.append(AttachmentIndex.read(stream_of(body)))
         elif opcode == Opcode.METADATA_INDEX:
-            summary.metadata.append(MetadataIndex.read(stream))
+            summary.metadata.append(MetadataIndex.read(stream_of(body)))
         elif opcode == Opcode.STATISTICS:
-            summary.statistics = Statistics.read(stream)
+            summary.statistics = Statistics.read(stream_of(body))
     _check_places(summary, data_end)
     _check_counts(summary)
     return summary

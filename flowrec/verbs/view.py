@@ -71,8 +71,10 @@ def view(
     from flowrec.view import open_viewer
     from flowrec.view import screenshot as take
 
-    if live or console:
-        return _watch(session, live, "serve" if no_open else "spawn", console, (beside, out, screenshot, time, layout))
+    if live:
+        return _watch(session, "serve" if no_open else "spawn", console, (beside, out, screenshot, time, layout))
+    if console:
+        raise UsageError("--console: steers a run that is being recorded; say --live, too")
     if session is None:
         raise UsageError("SESSION: name a session (.mcap), or --live for a run that is being recorded")
     if session.suffix == ".rrd" and not session.exists():
@@ -107,11 +109,7 @@ def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: 
     return export(opened, out, overwrite, beside=second), []
 
 
-def _watch(
-    session: Path | None, live: bool, mode: Literal["spawn", "serve"], console: bool, outputs: Iterable[object]
-) -> Told:
-    if not live:
-        raise UsageError("--console: steers a run that is being recorded; say --live, too")
+def _watch(session: Path | None, mode: Literal["spawn", "serve"], console: bool, outputs: Iterable[object]) -> Told:
     if any(value is not None for value in outputs):
         raise UsageError("--live: shows a run that is being recorded, and writes no file")
     from flowrec.verbs.watching import watch

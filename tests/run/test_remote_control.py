@@ -18,6 +18,7 @@ from flowrec.core.errors import FlowrecError
 from flowrec.run import remote_control
 from flowrec.run.control import RunControl
 from flowrec.run.remote_control import CommandSocket, RemoteControl
+from tests.conftest import until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the folder of the sockets is looked at")
 
@@ -64,7 +65,7 @@ def test_a_connection_that_says_nothing_or_too_much_does_not_keep_others_out(
                 loud.send_bytes(rubbish)
             assert remote.obey({"command": "mark", "text": ""}) == "", rubbish[:2]
         silent.close()
-    assert not [thread for thread in threading.enumerate() if thread.name == "commands" and thread.join(5.0)]
+    until(lambda: not [thread for thread in threading.enumerate() if thread.name == "commands"])
 
 
 def test_the_socket_is_in_a_folder_of_the_user_and_a_killed_run_leaves_none_in_the_way(places: Path) -> None:

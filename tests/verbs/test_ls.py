@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
+from websockets.sync.client import connect
 
 from flowrec.core.errors import SessionError, UsageError
 from flowrec.run.control import RunControl
@@ -76,7 +77,6 @@ def test_a_run_that_is_going_on_is_listed_as_such(tmp_path: Path) -> None:
 @pytest.mark.slow("two runs in real time")
 @pytest.mark.skipif(sys.platform == "win32", reason="descriptors are inherited by POSIX processes only")
 def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_path: Path) -> None:
-    connect = pytest.importorskip("websockets.sync.client").connect
     path = tmp_path / "x.mcap"
     recorded = SessionReader(session)
     with SessionWriter(path, recorded.header, WriterOptions(own_process=True, block=True, flush_s=0.05)) as writer:

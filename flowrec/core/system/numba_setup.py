@@ -22,7 +22,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from flowrec.core.system.regular_file import make_own_folder, user_id
+from flowrec.core.system.regular_file import make_own_folder, own_temporary_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -122,7 +122,7 @@ def _places() -> Iterator[Path]:
         home = os.path.expanduser("~/.cache")  # noqa: PTH111 - which raises nothing where there is no home
     if os.path.isabs(home):  # noqa: PTH117
         yield Path(home, "flowrec")
-    yield Path(tempfile.gettempdir(), f"flowrec-{user_id()}")
+    yield own_temporary_folder()
 
 
 def _remove_unused(place: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import stat
 import sys
+import tempfile
 from pathlib import Path
 
 from flowrec.core.errors import FlowrecError, UsageError
@@ -46,11 +47,16 @@ def make_own_folder(folder: Path) -> None:
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != user_id() or found.st_mode & 0o022:
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != _user_id() or found.st_mode & 0o022:
         raise PermissionError(f"{folder}: is not a folder in which this user alone can write")
 
 
-def user_id() -> int:
+def own_temporary_folder() -> Path:
+    """Path for temporary files that outlive a process of this user; `make_own_folder` makes it."""
+    return Path(tempfile.gettempdir(), f"flowrec-{_user_id()}")
+
+
+def _user_id() -> int:
     """Number of the user; 0 on Windows, where files have none."""
     number = 0
     if sys.platform != "win32":
