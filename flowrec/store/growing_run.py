@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import getpass
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -90,6 +90,12 @@ class GrowingRun:
     def chip(self) -> Chip:
         """The chip."""
         return self.header.chip()
+
+    @property
+    def outcome(self) -> Mapping[str, str]:
+        """The outcome of the run, and its figures; empty before its end."""
+        with self._file.reader() as reader:
+            return reader.outcome
 
     def ticks(self) -> Iterator[Tick]:
         """The ticks as they come, from the beginning of the present file to the end of the run.

@@ -15,6 +15,7 @@ from flowrec.core import FlowrecError, UsageError, View, say, seconds
 from flowrec.physics import Chip
 from flowrec.run import RemoteControl, Sink
 from flowrec.stages import ResolvedConfig
+from flowrec.verbs.run_summary import GOOD_ENDS
 
 if TYPE_CHECKING:
     from flowrec.view import LiveView
@@ -118,8 +119,9 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool =
             for sink in shown.sinks:
                 sink.write(tick)
             last_ns = tick.stamp_ns
-        text = f"the run has ended at {seconds(last_ns):.1f} s"
-        ended = RunEnded(text, str(run.path), good=True)
+        outcome = run.outcome.get("outcome", "unknown")
+        text = f"the run has ended at {seconds(last_ns):.1f} s: {outcome}"
+        ended = RunEnded(text, str(run.path), good=outcome in GOOD_ENDS)
         say(f"{run.path}: {text}")
     finally:
         shown.close(ended)

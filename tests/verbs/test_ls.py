@@ -105,9 +105,11 @@ def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_pat
                 assert next(word for word in answers if "answers" in word) == {"answers": 7, "refusal": ""}
                 event = control.next_event(10**9, held=False)
                 assert event is not None and event.action == "pause"
-            writer.close()
+                writer.close({"outcome": "lost"})
+                told = [json.loads(word) for word in page if isinstance(word, str)]
+                assert "lost" in told[-1]["ended"]["outcome"] and not told[-1]["ended"]["good"]
             last = view.stderr.read()
-    assert view.returncode == 0 and f"the run has ended at {tick.stamp_ns / 1e9:.1f} s" in last
+    assert view.returncode == 0 and f"the run has ended at {tick.stamp_ns / 1e9:.1f} s: lost" in last
     with pytest.raises(SessionError, match="is not being recorded"):
         typed("view", path, "--live")
     with pytest.raises(UsageError, match="name a session"):
