@@ -28,6 +28,7 @@ from flowrec.core.errors import FlowrecError, SessionError, UsageError
 from flowrec.core.messages import OperatorEvent
 from flowrec.core.system.locks import open_new
 from flowrec.core.system.outputs import OutputError
+from flowrec.store.session import Session
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.cli import app
@@ -35,6 +36,7 @@ from flowrec.verbs.listed import columns_of
 from flowrec.verbs.ls import ls
 from tests.conftest import HANG_S
 from tests.extras import needs
+from tests.rewritten import rewrite
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.s3_server import BUCKET, s3_server
 
@@ -130,6 +132,13 @@ def test_two_processes_write_the_same_rows_as_one(catalogued: Path, tmp_path: Pa
     assert (found.sessions, found.new, found.broken) == (7, 7, 3)
     one, two = (find(catalog=path).as_json()["sessions"] for path in (catalogued / NAME, tmp_path / "two.parquet"))
     assert [{**row, "path": row["name"]} for row in one] == [{**row, "path": row["name"]} for row in two]
+
+
+def test_a_session_that_another_program_has_written_anew_has_the_same_content(lab: Path, tmp_path: Path) -> None:
+    written = tmp_path / "anew.mcap"
+    rewrite(lab / "a.mcap", written)
+    assert written.read_bytes() != (lab / "a.mcap").read_bytes()
+    assert content_of(Session(written)) == content_of(Session(lab / "a.mcap"))
 
 
 def test_ls_and_find_have_the_same_columns_values_and_answers(catalogued: Path) -> None:
