@@ -71,17 +71,23 @@ def test_a_mission_that_surveys_and_refines_arrives_and_replays_exactly(tmp_path
     config = load_config(None, [*COMMON, *mission, *kind, "camera.rate_hz=40.0"])
     chip = load_chip(config.chip)
     resolved = resolve(config, chip)
-    session, errors = tmp_path / "s.mcap", tmp_path / "stderr"
-    view = EmulatedView(tmp_path, resolved)
-    with (
-        device("ni", tmp_path) as coils,
-        live_world(assemble(resolved, chip), resolved, coils, view) as (world, truths),
-    ):
-        sets = (*COMMON, *PATIENT, *mission, RATE, "recording.anonymous=true", "refine.method=assimilate")
-        with recorder(session, *sets, *view.sets, *coils.sets, errors=errors) as process:
-            assert process.wait(240.0) == 0, errors.read_text()[-2000:]
-        _, volts = coils.outputs()
-        truth = world.true_field
+    sets = (*COMMON, *PATIENT, *mission, RATE, "recording.anonymous=true", "refine.method=assimilate")
+    for attempt in range(3):  # a computer that stood still for 0.1 s ends a run, and says so: the mission flies again
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        session, errors = folder / "s.mcap", folder / "stderr"
+        view = EmulatedView(folder, resolved)
+        with (
+            device("ni", folder) as coils,
+            live_world(assemble(resolved, chip), resolved, coils, view) as (world, truths),
+            recorder(session, *sets, *view.sets, *coils.sets, errors=errors) as process,
+        ):
+            status = process.wait(240.0)
+        if "the computer was too busy" not in errors.read_text():
+            break
+    assert status == 0, errors.read_text()[-2000:]
+    _, volts = coils.outputs()
+    truth = world.true_field
     away_um = np.hypot(*(np.array([one.position_um for one in truths]) - GOAL_UM).T)
     assert away_um.min() < 150.0, "the robot of the world was at the goal"
     assert np.abs(volts).max() > 1.0 and not volts[-1].any()
