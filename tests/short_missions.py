@@ -12,6 +12,7 @@ SMALL = [
     "recording.admission_s=0",  # what the machine holds beside all other tests is of no interest
     "recording.own_process=false",  # which loads its own libraries, for longer than the mission takes
     "mission.check_axes=false",
+    "mission.goal=outlet",
 ]
 
 # In real time, and still under way however long a busy machine takes for what a test does meanwhile.

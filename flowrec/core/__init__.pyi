@@ -54,6 +54,7 @@ from .provenance import PACKAGE as PACKAGE, provenance as provenance, user_name 
 from .ranges import (
     Fault as Fault, OneOf as OneOf, PositiveShare as PositiveShare, Range as Range, Seed as Seed, Share as Share,
     Threads as Threads, Weight as Weight, check_ranges as check_ranges, faults as faults, hints as hints,
+    range_of as range_of,
 )
 from .summary import (
     DOUBTS as DOUBTS, Figures as Figures, Row as Row, Value as Value, as_text as as_text,
@@ -81,7 +82,7 @@ from .system.leftovers import (
 from .system.locks import (
     hold_file as hold_file, is_growing as is_growing, open_new as open_new, remove_idle as remove_idle, try_lock as try_lock,
 )
-from .system.numba_setup import compiled as compiled, kernels_cached as kernels_cached
+from .system.numba_setup import compiled as compiled, keep_kernels as keep_kernels, kernels_cached as kernels_cached
 from .system.output_folder import OutputFolder as OutputFolder, marker_of as marker_of
 from .system.outputs import (
     FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, Output as Output, OutputError as OutputError, PICTURE as PICTURE,

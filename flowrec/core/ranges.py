@@ -14,6 +14,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 from flowrec.core.errors import UsageError
 
 Number = int | float
+_ENDLESS = 2**62  # a limit beyond this is that of the type, and of no interest
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +28,7 @@ class Range:
         return self.low <= value <= self.high
 
     def __str__(self) -> str:
-        return f"from {short_number(self.low)} to {short_number(self.high)}"
+        return f"from {short_number(self.low)}" + (f" to {short_number(self.high)}" if self.high < _ENDLESS else "")
 
     def nearest(self, value: Number) -> Number:
         """The nearest valid value; the lower end for NaN."""

@@ -23,6 +23,7 @@ _Delay = Annotated[float, Range(0.0, 10.0)]
 class RobotSettings:
     """Section [robot] of a configuration. None: chosen to fit the chip when the configuration is resolved."""
 
+    # of the sphere, or of half of the longest side; walls are kept at least so far away
     radius_um: _Radius | None = None
     um_per_rev: Annotated[float, Range(0.01, 1e5)] = 25.0  # k: distance rolled per revolution of the field
     max_speed_um_s: _Speed | None = None  # v_max, relative to the fluid

@@ -127,6 +127,8 @@ def before_after(done: ReplayPair) -> list[Row]:
     if was.true_field is not None:
         add("assumed_flow_error", lambda tick: flow_error(done.session.chip, tick.assumed, was.true_field))
         add("refined_flow_error", lambda tick: flow_error(done.session.chip, tick.refined, was.true_field))
+    if any(tick.field is not None and tick.field.error_share is not None for tick in (was, now)):
+        add("stated_flow_error", lambda tick: tick.field.error_share if tick.field is not None else None)
     observations = now.observations or was.observations or no_observations(0)
     if len(observations.position_um) and was.field is not None and now.field is not None:
         add("observations", lambda _: len(observations.position_um))

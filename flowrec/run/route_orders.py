@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from flowrec.core import Mission, Observations, Phase, Route, Tick, seconds
-from flowrec.physics import FlowUncertainty, Robot
-from flowrec.stages import Pipeline, Sampling, SurveyOrder, better_route, memory_s, route_elsewhere
+from flowrec.physics import FlowUncertainty
+from flowrec.stages import Pipeline, Sampling, SurveyOrder, better_route, memory_s, robot_at, route_elsewhere
 
 _RECENT = 20  # observations, of which the noise of the next ones is expected
 
@@ -42,7 +42,7 @@ def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
             field,
             mission.start_um,
             pipeline.chip,
-            _robot(pipeline, order, mission),
+            robot_at(order, mission, pipeline.robot),
             mission.goal_um,
             _uncertainty(pipeline, order) if pipeline.survey.needs_uncertainty else None,
             _sampling(pipeline, order),
@@ -59,7 +59,7 @@ def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
     """The way to the goal; on the way there the present one, unless another is better or the goal a new one."""
     field = order.field
     assert field is not None
-    robot, planner = _robot(pipeline, order, mission), pipeline.planner
+    robot, planner = robot_at(order, mission, pipeline.robot), pipeline.planner
     if mission.phase != Phase.NAVIGATE:
         planned = planner.plan(field, mission.start_um, mission.goal_um, pipeline.chip, robot)
         return replace(planned, goal_um=mission.goal_um)
@@ -78,12 +78,6 @@ def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
         robot,
     )
     return replace(better, goal_um=mission.goal_um)
-
-
-def _robot(pipeline: Pipeline, order: Tick, mission: Mission) -> Robot:
-    """The robot as it is known in the tick: slower where it has stepped out, or a person limits its speed."""
-    limit_hz = order.health.limit_hz if order.health is not None else None
-    return pipeline.robot.limited_to(limit_hz).slowed_to(mission.speed_limit_um_s)
 
 
 def _uncertainty(pipeline: Pipeline, order: Tick) -> FlowUncertainty | None:

@@ -72,6 +72,11 @@ from .rig_settings import (
 )
 from .run_figures import (
     RunStatistics as RunStatistics, figures_of as figures_of, flow_error as flow_error, length_um as length_um,
+    robot_at as robot_at, shortest_way as shortest_way,
+)
+from .setting_rows import (
+    SettingRow as SettingRow, commented_toml as commented_toml, section_summary as section_summary,
+    setting_rows as setting_rows,
 )
 from .simulated_settings import (
     Optics as Optics, Simulated as Simulated, SimulatedImage as SimulatedImage,

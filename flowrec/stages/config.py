@@ -78,10 +78,11 @@ class Recording:
     queue_mb: Annotated[float, Range(1e-3, 1e6)] | None = None
     # Size and duration after which a run continues in another file; None or 0: one file.
     split_mb: Annotated[float, Range(0.0, 1e9)] | None = None
+    # length of a part after which the next one begins. None: one file
     split_s: Annotated[float, Range(0.0, 1e7)] | None = None
     # Only this time before and after events is written. None: everything.
     snapshot_before_s: Annotated[float, Range(0.0, 1e6)] | None = None
-    snapshot_after_s: Annotated[float, Range(0.0, 1e6)] = 10.0
+    snapshot_after_s: Annotated[float, Range(0.0, 1e6)] = 10.0  # time after a mark or an alarm that a snapshot holds
     # memory for the time before an event; if it is too small, less time is kept
     snapshot_mb: Annotated[float, Range(1e-3, 1e6)] = 1000.0
     # free space below which a run is ended as by Ctrl-C; 0: never
@@ -92,9 +93,9 @@ class Recording:
     # record also where the trial says that images will be lost, and go on when the recorder fails
     accept_losses: bool = False
     recover_leftovers: bool = True  # recover what killed runs have left in the same folder
-    operator: str = ""
-    notes: str = ""
-    sample: str = ""
+    operator: str = ""  # person who ran it, for the record
+    notes: str = ""  # free text, for the record
+    sample: str = ""  # of the experiment, for the record
     anonymous: bool = False  # do not record host, user, platform and local changes
 
 

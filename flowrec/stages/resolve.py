@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 
-from flowrec.core import UnreachableError, UsageError, nearest_pixel
+from flowrec.core import Phase, UnreachableError, UsageError, nearest_pixel
 from flowrec.physics import (
     USUAL_DELAY_S,
     Calibration,
@@ -72,13 +72,10 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     else:
         hold_s = _hold_s(config, chip)
         ramp_s = 0.0 if hold_s else config.coils.ramp_s
-        mission = _narrow(
-            PlacedMission,
-            config.mission,
-            start=_start(config.mission.start, chip, robot, course_error, config.flow, ramp_s),
-            goal=_point(chip, config.mission.goal, "goal", robot),
-            hold_start_s=hold_s,
-        )
+        start = _start(config.mission.start, chip, robot, course_error, config.flow, ramp_s)
+        usual = start if Phase.SURVEY in config.mission.phases else "outlet"
+        goal = _point(chip, usual if config.mission.goal is None else config.mission.goal, "goal", robot)
+        mission = _narrow(PlacedMission, config.mission, start=start, goal=goal, hold_start_s=hold_s)
         _refuse_apart(chip, mission)
     tracker = replace(config.tracker, polarity=config.tracker.polarity or "auto")
     simulated = config.simulated.with_preset() if config.rig == SIMULATED else config.simulated

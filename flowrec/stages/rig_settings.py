@@ -52,8 +52,8 @@ PointUm = tuple[_Coordinate, _Coordinate]
 class CameraSettings:
     """Section [camera] of a configuration. None: chosen when the configuration is resolved."""
 
-    width_px: _Side = 640
-    height_px: _Side = 512
+    width_px: _Side = 640  # of an image
+    height_px: _Side = 512  # of an image
     bits: _Bits = 8  # depth of a pixel; grey levels are below 2^bits
     rate_hz: _Rate | None = None  # None: chosen to fit the robot's speed
     um_per_px: _Scale | None = None  # None: the whole chip fills the image
@@ -66,8 +66,10 @@ class CameraSettings:
     # Stated by the file of a registration: when it was measured, in which picture, and how far the walls in the
     # picture are from where it puts them (root mean square).
     registered_on: str = ""
-    registered_from: str = ""
+    registered_from: str = ""  # file of the registration that was read, for the record
+    # root mean square distance of the registered points from where the registration puts them
     residual_um: Annotated[float, Range(0.0, 1e6)] | None = None
+    # of an image; the robot is where it was in the middle of that time
     exposure_s: Annotated[float, Range(0.0, 10.0)] = 0.004
 
 
@@ -95,17 +97,18 @@ class Columns:
     90 - phi; or a number that holds throughout. See stages/control/coil_log.py for what a log must tell.
     """
 
+    # name of the column with the time; a number: that for all rows. None: found by its name
     time_s: Column | None = None
-    frequency_hz: Column | None = None
+    frequency_hz: Column | None = None  # of the rotation of the field
     heading_deg: Column | None = None  # 0 to the right of the chip, 90 downwards
-    amplitude_mt: Column | None = None
+    amplitude_mt: Column | None = None  # of the rotating field
     heading_rad: Column | None = None  # or in rad, as in applied.csv of flowrec export --format csv
     i_x_a: Column | None = None  # or the currents
-    i_y_a: Column | None = None
-    i_z_a: Column | None = None
+    i_y_a: Column | None = None  # current of the coil pair along y
+    i_z_a: Column | None = None  # current of the coil pair along z
     b_x_mt: Column | None = None  # or the field
-    b_y_mt: Column | None = None
-    b_z_mt: Column | None = None
+    b_y_mt: Column | None = None  # field along y
+    b_z_mt: Column | None = None  # field along z
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,12 +127,13 @@ class MovieSettings:
     columns: Columns = field(default_factory=Columns)
     # Seconds of the log per second of the movie, and time of the log minus time of the movie at the first image.
     clock_rate: Annotated[float, Range(0.01, 100.0)] = 1.0
+    # time of the log at the first image; an import finds it by the motion of the robot
     clock_offset_s: Annotated[float, Range(-1e10, 1e10)] = 0.0
     # What the field does from one row of the log to the next: it keeps that of the row, or it changes evenly.
     between_rows: Literal["holds", "linear"] = "holds"
     # The heading in the chip is that of the log, with the opposite sign if it is mirrored, plus this.
     heading_offset_deg: Angle = 0.0
-    heading_mirrored: bool = False
+    heading_mirrored: bool = False  # the log counts its headings the other way round
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +173,7 @@ class Lab:
     device_config: str = ""  # of the camera: configuration file, where the driver needs one
     # upper left pixel of the image on the sensor; None: the image is in the middle of the sensor
     offset_x_px: Annotated[int, Range(0, 65_535)] | None = None
-    offset_y_px: Annotated[int, Range(0, 65_535)] | None = None
+    offset_y_px: Annotated[int, Range(0, 65_535)] | None = None  # likewise from the top
     pixel_format: str = ""  # '': Mono8, Mono10, ... by camera.bits
     gain: Annotated[float, Range(-100.0, 1e4)] | None = None  # in the camera's unit; None: as the camera has it
     trigger: str = ""  # '': the camera runs freely; 'software'; else the line that triggers it, such as 'Line1'

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import FLOW_FIELDS, Demand, Figures, FlowField, Outcome, Phase, Route, Tick, finite, seconds
-from flowrec.physics import Chip, relative_rmse
+from flowrec.core import FLOW_FIELDS, Demand, Figures, FlowField, Mission, Outcome, Phase, Route, Tick, finite, seconds
+from flowrec.physics import Chip, Robot, relative_rmse
+from flowrec.stages.planning.planner import Planner
 
 
 class RunStatistics:
@@ -73,14 +75,40 @@ def figures_of(
         figures["speed_limit_um_s"] = mission.speed_limit_um_s
     if true_field is not None:
         figures["contacts"] = contacts
-        for name in FLOW_FIELDS:
-            flow: FlowField | None = getattr(last, name)
-            if flow is not None:
-                figures[f"{name}_method"] = f"{flow.method}, another refused" if flow.refused else flow.method
-                figures[f"{name}_flow_error"] = flow_error(chip, flow, true_field)
+    for name in FLOW_FIELDS:
+        flow: FlowField | None = getattr(last, name)
+        if flow is not None:
+            figures[f"{name}_method"] = f"{flow.method}, another refused" if flow.refused else flow.method
+        if flow is not None and true_field is not None:
+            figures[f"{name}_flow_error"] = flow_error(chip, flow, true_field)
+    if last.field is not None and last.field.error_share is not None:
+        figures["stated_flow_error"] = finite(last.field.error_share)
     if last.observations is not None:
         figures["observations"] = len(last.observations.position_um)
     return figures
+
+
+def robot_at(tick: Tick, mission: Mission, robot: Robot) -> Robot:
+    """The robot as it is known in a tick: slower where it has stepped out, or a person limits its speed."""
+    limit_hz = tick.health.limit_hz if tick.health is not None else None
+    return robot.limited_to(limit_hz).slowed_to(mission.speed_limit_um_s)
+
+
+def shortest_way(last: Tick, planner: Planner, chip: Chip, robot: Robot) -> Figures:
+    """Length and duration of the shortest way from where the route of a tick begins to the goal: a null model.
+
+    The duration is None where the flow on that way is too fast for the robot. Empty where nothing was navigated.
+    """
+    mission, route = last.mission, last.route
+    if mission is None or route is None or last.field is None or mission.outcome != Outcome.REACHED:
+        return {}
+    if mission.phase != Phase.DONE or len(route.waypoints_um) == 0:
+        return {}
+    by_length = replace(planner, method="astar_length", cost="time")
+    shortest = by_length.plan(last.field, route.waypoints_um[0], mission.goal_um, chip, robot_at(last, mission, robot))
+    if not shortest.reachable:
+        return {"shortest_way_s": None}
+    return {"shortest_way_um": length_um(shortest), "shortest_way_s": float(shortest.arrival_s[-1])}
 
 
 def length_um(route: Route) -> float:

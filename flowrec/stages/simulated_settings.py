@@ -48,7 +48,7 @@ class Simulated:
     """
 
     world: Literal["kind", "moderate", "hard"] = "moderate"  # preset of the settings that are None: WORLDS
-    seed: Seed = 0
+    seed: Seed = 0  # of all that is drawn: world, noise, bodies
     # The flow.
     # each true inlet speed is the assumed one times 1 +- (a third of this to all)
     inlet_speed_error: _PartOf | None = None
@@ -69,7 +69,7 @@ class Simulated:
     # The pump: the true flow is the steady one times (1 + drift) (1 + pulsation_share sin(2 pi hz t + phase)).
     drift_share: Annotated[float, Range(0.0, 0.3)] | None = None  # one sigma of the drift, a random process
     drift_s: Annotated[float, Range(0.1, 1e5)] | None = None  # correlation time of the drift
-    pulsation_share: _PartOf | None = None
+    pulsation_share: _PartOf | None = None  # amplitude of the pump's pulsation, as a ratio of the inflow
     pulsation_hz: _Rate | None = None  # None, also in the preset: drawn from 0.05 to 2, uniformly in the logarithm
     pulsation_phase_deg: Angle | None = None  # likewise from 0 to 360
     k: Annotated[int, OneOf(1, 2, 4)] | None = None  # cells of the true flow per pixel side of the true walls' mask
@@ -96,15 +96,17 @@ class Simulated:
     # Its true registration: shifted by half of to all of offset_px (camera pixels) in any direction, turned by up to
     # angle_error_deg and scaled by up to 1 +- scale_error from that of [camera].
     offset_px: Annotated[float, Range(0.0, 1e3)] | None = None
+    # by which the chip lies turned from where the registration puts it
     angle_error_deg: Annotated[float, Range(0.0, 45.0)] | None = None
-    scale_error: _PartOf | None = None
+    scale_error: _PartOf | None = None  # by which the image scale differs from the stated one, as a ratio
     um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None  # None: drawn, as the next two
-    angle_deg: Angle | None = None
+    angle_deg: Angle | None = None  # true angle of the camera. None: the stated one and the error above
+    # point of the chip that is truly in the middle of the image. None: by the stated registration
     centre_um: PointUm | None = None
     mirror: bool | None = None  # None: as [camera] states it
     # The stage swings by this amplitude in a drawn direction, and the image with it.
     shake_um: Annotated[float, Range(0.0, 1e3)] | None = None
-    shake_hz: _Rate | None = None
+    shake_hz: _Rate | None = None  # mean frequency of the shaking of the image
     image: SimulatedImage = field(default_factory=SimulatedImage)
     optics: Optics | None = None  # disc: the profile that the tracker fits; oblique: rigs/simulated/microscope.py
     # relative rate error of the camera's clock; None: drawn, up to 50 either way

@@ -4,9 +4,9 @@ The images of the camera pass through the whole pipeline, the writer and the dis
 for some seconds. Nothing is energised, and what was written is removed. Besides, the process of the slow stages has
 then done the first order of the mission: it has imported, compiled and factorised what that needs.
 
-Before that comes a rehearsal: a short simulated mission, in memory, that compiles and imports what a run will need. The
-first run of an installation compiles for half a minute. A live run that did so while its camera delivers would lose the
-images of that time; what is compiled stays in the cache of kernels.
+Before that, and before the first run of an installation, comes a rehearsal: a short simulated mission, in memory, that
+compiles and imports what a run will need. That takes half a minute. A live run that did so while its camera delivers
+would lose the images of that time; what is compiled stays in the cache of kernels.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from flowrec.core import (
     Route,
     Tick,
     UsageError,
+    keep_kernels,
     kernels_cached,
     nanoseconds,
     realtime_priority,
@@ -218,6 +219,7 @@ _ADOPT_AFTER_S = 0.1
 _HELP_S = 600.0  # of CPU time, at most
 _SETTINGS = {
     "chip.name": "straight",
+    "mission.goal": "outlet",
     "camera.width_px": 96,
     "camera.height_px": 77,
     "camera.rate_hz": 15.0,
@@ -262,6 +264,8 @@ def rehearse(config: Config, stopped: Callable[[], object] = lambda: False, prog
         if not kernels_cached():  # two processors compile in two thirds of the time
             helper.begin(route_on_assumed_flow, resolved, chip)
         run(pipeline, SimulatedRig.of(pipeline, resolved, LENGTH_S), worker, [], control=control, on_tick=on_tick)
+    if not control.reason:
+        keep_kernels()
 
 
 def route_on_assumed_flow(config: ResolvedConfig, chip: Chip) -> Route:
@@ -273,7 +277,7 @@ def route_on_assumed_flow(config: ResolvedConfig, chip: Chip) -> Route:
 def rehearse_aloud(config: Config, control: Unattended) -> None:
     """Rehearse with progress; a stop of the run does not wait for it."""
     if not kernels_cached():
-        say("compiling the numerics, once after an installation: about half a minute")
+        say("compiling the numerics, once after an installation: half a minute")
     run_control = control.run_control
     with control.progress("getting ready", LENGTH_S) as progress:
         run_control.unless_stopped(lambda: rehearse(config, lambda: run_control.reason, progress), None)

@@ -43,6 +43,7 @@ from flowrec.verbs.record import record
 from flowrec.verbs.recover import recover
 from flowrec.verbs.replay import DEFAULT_REFINE, replay
 from flowrec.verbs.report import report
+from flowrec.verbs.settings import settings
 from flowrec.verbs.sign import sign
 from flowrec.verbs.view import view
 
@@ -106,7 +107,7 @@ add_verb(app, replay)
 add_verb(app, import_movie, "import")
 for _verb in (
     *map(from_above, ("sweep", "push", "catalog", "find")),
-    *(methods, new, doctor, view, export, report, info, ls, note, check, sign, recover, compare),
+    *(settings, methods, new, doctor, view, export, report, info, ls, note, check, sign, recover, compare),
 ):
     add_verb(app, _verb)
 OUR_VERBS.update(str(each.name) for each in app.registered_commands)

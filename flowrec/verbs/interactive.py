@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from flowrec.run import DiskMonitor, Watchdog
     from flowrec.store import SessionWriter
 
-_EXPLAIN_AFTER_S = 2.0  # without a tick
 _PERIOD_S = 0.12
 _CLOSE_TIMEOUT_S = 0.3  # for the last events to be shown
 _EVENTS_LIMIT = 1000
@@ -157,7 +156,6 @@ class StatusLine:
         self._last = tick
 
     def _show(self, over: threading.Event) -> None:
-        began, explained = time.perf_counter(), False
         with ExitStack() as stack:
             live: Live | None = None
             if console.is_terminal:
@@ -170,10 +168,6 @@ class StatusLine:
                     _print(self._events.popleft())
                 if last:
                     return
-                arrivals = list(self._arrivals)
-                if not explained and time.perf_counter() - max([began, *arrivals[-1:]]) > _EXPLAIN_AFTER_S:
-                    explained = True
-                    say("working ... (the first run after an installation compiles its numerics, some 20 s in all)")
                 if live is not None and self._last is not None:
                     live.update(self.text(self._last), refresh=True)
 

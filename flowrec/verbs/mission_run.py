@@ -24,6 +24,7 @@ from flowrec.core import (
     View,
     as_text,
     doubts_text,
+    kernels_cached,
     realtime_priority,
     say,
     warn,
@@ -50,6 +51,7 @@ from flowrec.stages import (
     Config,
     RunStatistics,
     extra_rows,
+    shortest_way,
 )
 from flowrec.store import SessionWriter, session_writer
 from flowrec.verbs.admission import admit, rehearse_aloud
@@ -189,7 +191,7 @@ class _Mission:
             verdict = checked_image(rig.picture(), config, chip, "camera")
             self._source |= {"source_axes": verdict.text} if verdict is not None else {}
         tried = self._realtime and config.recording.admission_s > 0.0
-        if tried:
+        if tried or not kernels_cached():
             rehearse_aloud(config, self._control)
         adopt_after_s, pipeline = config.worker.adopt_after_s, self._pipeline
         worker: Worker = ProcessWorker(pipeline) if self._realtime else LockstepWorker(pipeline, adopt_after_s)
@@ -269,6 +271,8 @@ class _Mission:
         """Figures of the run, with the reasons to doubt it."""
         config, rig, walls, report = self._config, self._rig, self._prepared.walls, self._report
         facts = figures_of(self._chip, report, self._statistics.true_field)
+        if not self.run_control.reason:  # a run that is stopped ends at once
+            facts |= shortest_way(report.last, self._pipeline.planner, self._chip, self._pipeline.robot)
         # Without navigation, and for a control law that descends the time to go, there is no reference.
         if not (config.mission.observes or config.control.needs):
             facts["tracking_error_um"] = self._statistics.tracking_error_um

@@ -23,7 +23,7 @@ from flowrec.core import (
     warn,
 )
 from flowrec.measure import ImageVerdict, WallsState, orientation_by_image, walls_state
-from flowrec.physics import Chip, load_chip, median_width_um
+from flowrec.physics import Chip, load_chip, median_width_um, sample
 from flowrec.rigs import fitted_to_movie, open_source
 from flowrec.run import refuse_below
 from flowrec.stages import (
@@ -104,8 +104,8 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
     made = derived_values(given, config)
     if made:
         what = "derived to fit the movie and the chip" if asked.rig == MOVIE else "derived to fit the chip"
-        unused = ("survey.", "plan.") if config.mission.observes else ()
-        tell(f"{what}: {', '.join(f'{key} = {value:g}' for key, value in made.items() if not key.startswith(unused))}")
+        told = [f"{key} = {value:g}" for key, value in made.items() if key.startswith(("robot.", "camera."))]
+        tell(f"{what}: {', '.join(told or made)} (record --dry-run lists all settings)")
     refuse_adrift(config, chip)
     full_mt = config.coils.full_mt(config.robot)
     if full_mt < config.coils.amplitude_mt:
@@ -163,7 +163,8 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
     Raises
     ------
     UnreachableError : the flow at the start is too fast to hold the robot there; the flow carries it out of an outlet
-        before the ramp of the coils is complete; every route to the goal is too narrow, or too fast to be steered on.
+        before the ramp of the coils is complete; every route to the goal is too narrow, or too fast to be steered on;
+        a robot that is to come back to its start is slower than the flow there.
     """
     if config.mission.observes:
         return
@@ -179,6 +180,13 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
         reason = reason or too_swift(chip, field, start, goal, course_error)
         if reason:
             raise UnreachableError(f"unreachable: {reason}")
+        flow_um_s = float(np.hypot(*sample(field, goal)))
+        if Phase.SURVEY in config.mission.phases and np.array_equal(start, goal) and flow_um_s > robot.speed_limit_um_s:
+            raise UnreachableError(
+                f"unreachable: from the survey the robot can not come back to its start {goal[0]:.0f},{goal[1]:.0f} "
+                f"um: the flow there is {flow_um_s:.0f} um/s, and it swims at {robot.speed_limit_um_s:.0f} um/s at most; "
+                "give another goal, as in --goal outlet"
+            )
     reason = swept_out(chip, field, start, course_error, 0.0 if config.mission.hold_start_s else config.coils.ramp_s)
     if reason:
         raise UnreachableError(f"unreachable: {reason}")

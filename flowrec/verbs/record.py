@@ -11,7 +11,7 @@ from flowrec.verbs.command import MisuseError, Told, verb
 from flowrec.verbs.options import AS_THE_COMMAND, ATTENDED, AsConfig, Asked, Overwrite, SessionOut, Sets, readable_toml
 
 if TYPE_CHECKING:
-    from flowrec.stages import Config, ResolvedConfig
+    from flowrec.stages import Config
     from flowrec.verbs.doctor import Diagnosis
     from flowrec.verbs.interactive import Unattended
     from flowrec.verbs.run_summary import Recorded
@@ -22,11 +22,12 @@ class DryRun(NamedTuple):
 
     Attributes
     ----------
-    config : resolved on its chip.
+    config : resolved on its chip; for `short` as asked, of which only what differs from the defaults is printed.
     diagnosis : what the doctor finds, which looks when it is asked; None where the rig is not a lab's.
     """
 
-    config: "ResolvedConfig"
+    config: "Config"
+    short: bool
     diagnosis: "Diagnosis | None"
 
     @property
@@ -35,11 +36,11 @@ class DryRun(NamedTuple):
         return self.diagnosis.exit_status if self.diagnosis is not None else 0
 
     def show(self) -> None:
-        """Print the configuration, then what the doctor finds, which 300 lines of settings would hide before them."""
+        """Print the configuration, then what the doctor finds, which a thousand lines would hide before them."""
         from flowrec.core import say
-        from flowrec.stages import to_toml
+        from flowrec.stages import commented_toml
 
-        typer.echo(to_toml(self.config))
+        typer.echo(commented_toml(self.config, self.short), nl=False)
         if self.diagnosis is not None:
             for line in self.diagnosis.lines():
                 say(line)
@@ -89,6 +90,9 @@ def record(
         typer.Option(
             "--dry-run", help="Energise nothing: check mission and devices, print the resolved configuration."
         ),
+    ] = False,
+    short: Annotated[
+        bool, typer.Option("--short", help="With --dry-run: only the settings that differ from their defaults.")
     ] = False,
     split: Annotated[
         str | None,
@@ -146,13 +150,17 @@ def record(
     from flowrec.stages import MOVIE
 
     path = None if out is None else Path(out)
+    if short and not dry_run:
+        raise MisuseError("prints a part of what --dry-run prints; give both", "--short")
     if dry_run:
         from flowrec.verbs.doctor import look_at_lab
         from flowrec.verbs.preparation import prepare
 
         resolved = prepare(chosen).config
         file = inputs[0] if inputs else None
-        return DryRun(resolved, look_at_lab(chosen, file, path) if chosen.rig == "lab" else None)
+        return DryRun(
+            chosen if short else resolved, short, look_at_lab(chosen, file, path) if chosen.rig == "lab" else None
+        )
     from flowrec.store import refuse_unusable_key, sign_file
     from flowrec.verbs.mission_run import run_mission
 

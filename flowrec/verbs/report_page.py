@@ -17,7 +17,6 @@ from flowrec.core import (
     Outcome,
     Output,
     OutputFolder,
-    Row,
     UsageError,
     doubts_of,
     name_of,
@@ -321,12 +320,9 @@ def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]
 
 
 def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
-    # The error that the best map states for itself.
-    was, now = (tick.field.error_share if tick.field is not None else None for tick in (pair.recorded, pair.replayed))
-    stated: Row = ("stated_flow_error", was, now)
     texts = [
         (name_of(key), _micro(text_of_figure(key, was)), _micro(text_of_figure(key, now)), MEANINGS.get(key, ""))
-        for key, was, now in [*before_after(pair), stated]
+        for key, was, now in before_after(pair)
     ]
     changed = _changed_settings(pair)
     of_changed = ("setting", "recorded", "replayed") if changed else ()

@@ -1,4 +1,4 @@
-"""The result of `flowrec record`: files, figures, exit status, and the table at the end of a run."""
+"""The result of `flowrec record`: files, figures, exit status, and what is said at the end of a run."""
 
 from __future__ import annotations
 
@@ -7,13 +7,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flowrec.core import DOUBTS, Coverage, Figures, FlowField, Outcome, doubts_of, rows_for_people, say, table, warn
+from flowrec.core import (
+    FLOW_FIELDS,
+    Coverage,
+    Figures,
+    FlowField,
+    Outcome,
+    doubts_of,
+    name_of,
+    say,
+    text_of_figure,
+    warn,
+)
 from flowrec.physics import Chip
 from flowrec.run import RunReport
 from flowrec.stages import MotionOfRun, Pipeline, ResolvedConfig, TrackQuality, map_doubts
 from flowrec.stages import figures_of as figures_of_ticks
 from flowrec.store import is_snapshot
 
+# What is said at the end of a run where there is any.
+_ALSO = (
+    *("contacts", "frames_dropped", "speed_limit_um_s", "latest_goal"),
+    *("covered", "not_refined", "note_movie", "note_not_finished", "rrd"),
+)
 # The mission was completed, or was ended on purpose.
 GOOD_ENDS = frozenset(
     outcome for outcome in Outcome if outcome.completes_mission or outcome in (Outcome.STOPPED, Outcome.TIME_OVER)
@@ -73,11 +89,31 @@ class Recorded:
         derived = {"derived": dict(self.derived), "files": [*map(str, self.files)]}
         return {"path": str(self.path), **self.facts, **derived}
 
+    def lines(self) -> list[str]:
+        """The end of the run and what was won, as text: outcome, way, flow, files; what is not known is left out."""
+        text = {key: text_of_figure(key, value) for key, value in self.facts.items() if value is not None}
+        note = f" ({text['note']})" if text.get("note") else ""
+        ended = [f"{text['outcome']}{note} after {text['duration_s']}, computed in {text['wall_s']}"]
+        if "navigation_s" in text:
+            ended.append(
+                f"{text['route_length_um']} to the goal in {text['navigation_s']}, {_against_shortest(self.facts)}"
+            )
+        maps = [
+            " ".join(filter(None, (name, text.get(f"{name}_flow_error"), f"({text[f'{name}_method']})")))
+            for name in FLOW_FIELDS
+            if f"{name}_method" in text
+        ]
+        flow = [f"flow{' error' if 'assumed_flow_error' in text else ''}: {', '.join(maps)}"] if maps else []
+        if flow and "stated_flow_error" in text:
+            flow[0] += f"; the map states an error of {text['stated_flow_error']}"
+            flow[0] += f", from {text['observations']} observations" if "observations" in text else ""
+        also = [f"{name_of(key)}: {text[key]}" for key in _ALSO if self.facts.get(key)]
+        return ["; ".join(ended), *flow, *also, f"file: {files_text(self.path, self.files)}"]
+
     def show(self) -> None:
-        """Print the table at the end of a run, and what to do next."""
-        files = ("file", files_text(self.path, self.files))
-        facts = {key: value for key, value in self.facts.items() if key != DOUBTS}  # they are told below
-        table("Session", ("", "value"), [*rows_for_people(facts), files])
+        """Print how the run ended, and what to do next."""
+        for line in self.lines():
+            say(line)
         sessions, report, covered = self.sessions, self.report, self.covered
         if self.lost:
             say(
@@ -91,6 +127,17 @@ class Recorded:
             warn(f"doubtful: {doubt}")
         if sessions:
             say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")
+
+
+def _against_shortest(facts: Figures) -> str:
+    """The planned duration, and that of the shortest way."""
+    planned = f"planned {text_of_figure('planned_s', facts.get('planned_s'))}"
+    if "shortest_way_s" not in facts:
+        return planned
+    if facts["shortest_way_s"] is None:
+        return f"{planned}; on the shortest way the flow is too fast for the robot"
+    length, time = (text_of_figure(key, facts[key]) for key in ("shortest_way_um", "shortest_way_s"))
+    return f"{planned}; the shortest way ({length}) would take {time}"
 
 
 def judges_of(pipeline: Pipeline) -> tuple[TrackQuality, MotionOfRun]:

@@ -170,7 +170,7 @@ def test_a_goal_that_is_found_unreachable_before_the_run_fails_as_one_found_duri
 
 
 def test_a_goal_in_another_channel_is_unreachable() -> None:
-    config = load_config(None, ["chip.name=straight", "robot.max_speed_um_s=600"])
+    config = load_config(None, ["chip.name=straight", "robot.max_speed_um_s=600", "mission.goal=outlet"])
     chip = load_chip(config.chip)
     mask = chip.mask.copy()
     mask[:, mask.shape[1] // 2] = False

@@ -30,6 +30,7 @@ _PACKAGE = Path(__file__).parents[2]
 _DECORATED = "\n@compiled\n"  # in a file with kernels
 _OWN = Path("core", "system", "numba_setup.py")
 _PREFIX = "numba-"
+_COMPLETE = "complete"
 _UNUSED_DAYS = 30.0  # then a cache of other sources is removed
 
 
@@ -84,9 +85,16 @@ def _register() -> None:
 
 
 def kernels_cached() -> bool:
-    """True if kernels of this installation have been compiled."""
+    """True if `keep_kernels` has said that a run finds its kernels in the cache."""
     folder = _cache_folder()
-    return bool(folder) and any(Path(folder).rglob("*.nbi"))
+    return bool(folder) and Path(folder, _COMPLETE).exists()
+
+
+def keep_kernels() -> None:
+    """Note that the kernels of a run are in the cache; does nothing where nothing can be written."""
+    if folder := _cache_folder():
+        with contextlib.suppress(OSError):  # the next run compiles what is missing, and notes it
+            Path(folder, _COMPLETE).touch()
 
 
 def kernel_files(package: Path = _PACKAGE) -> list[Path]:

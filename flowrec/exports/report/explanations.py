@@ -52,6 +52,8 @@ MEANINGS: dict[str, str] = {
     "residual_um_s": "root mean square of observed minus mapped flow",
     "travel_time_on_replayed_map_s": "of the route, in the flow of the replay's map",
     "controller": "control law",
+    "shortest_way_um": "from where the last route begins to the goal, for comparison",
+    "shortest_way_s": "time on the shortest way by the same map; empty where the flow is too fast on it",
     "commands_compared": "demands of the controller, one an image",
     "commands_changed": "of them, by more than 1 µm/s",
     "commands_difference_rms_um_s": "of the demanded velocity, root mean square",

@@ -25,11 +25,13 @@ class ChipSettings:
     path: str = ""  # instead of the name: *.png (*.toml beside it), *.toml (*.png beside it) or *.npz vessel case
     seed: Seed = 0  # of the vessels
     um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None  # needed for a PNG that has no TOML
+    # smooth: a contour through the pixels of the mask; pixel: their edges. None: as the chip's file states
     walls: Walls | None = None
     # channel depth, for the depth-averaged friction; 0: two-dimensional
     depth_um: Annotated[float, Range(0.0, 1e5)] | None = None
+    # of the fluid; of one that is not Newtonian, the unit of its law. None: as the chip's file states
     viscosity_mpa_s: Annotated[float, Range(1e-3, 1e5)] | None = None
-    density_kg_m3: Annotated[float, Range(1.0, 3e4)] | None = None
+    density_kg_m3: Annotated[float, Range(1.0, 3e4)] | None = None  # of the fluid. None: as the chip's file states
     # mean speed of the fastest inlet; the others keep their ratio to it
     inlet_speed_um_s: Annotated[float, Range(0.0, 1e7)] | None = None
     # Openings that are inlets, all others outlets at 0 Pa: "left:0" is the first on the left from the top,

@@ -255,6 +255,7 @@ def from_function(function: str) -> TabulatedLaw:
 class ViscositySettings:
     """Section [chip.viscosity], and [viscosity] of a chip's TOML. None: that of the chip, or the default of the law."""
 
+    # how the viscosity depends on the shear rate. None: as the chip's file states
     law: Annotated[str, LAWS] | None = None
     exponent: Annotated[float, Range(0.1, 3.0)] | None = None  # n; below 1: thinner at higher shear rates
     rate_1_s: Annotated[float, Range(1e-6, 1e6)] | None = None  # shear rate at which viscosity_mpa_s holds

@@ -27,6 +27,7 @@ class FlowSolver:
     """
 
     k: Annotated[int, OneOf(1, 2, 4)] = 1  # subcells per pixel side: 1, 2 or 4
+    # of Newton's method; a flow that has not converged by then is an error
     max_iterations: Annotated[int, Range(1, 10_000)] = 40
     tolerance: Annotated[float, Range(1e-14, 0.1)] = 1e-9  # last Newton step over the fastest velocity
     convection: bool = True  # False: Stokes flow

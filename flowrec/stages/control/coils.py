@@ -30,6 +30,7 @@ class Coils:
     triple and a right-handed screw has handedness `left`.
     """
 
+    # roller: the field turns about an axis across the heading; helix: about the heading
     mode: Literal["roller", "helix"] = "roller"
     surface: Literal["floor", "ceiling"] = "floor"  # on which a roller rolls
     handedness: Literal["right", "left"] = "right"  # of a helix

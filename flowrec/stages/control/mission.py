@@ -63,11 +63,14 @@ class MissionStateMachine:
     the robot is watched and never driven, whether it is in sight or not, until the frames end or a person ends it; then
     the flow is refined with all observations. `start` and `goal`, which `observe` does not use, are points (x, y) in um
     on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
+    Without a `goal` the robot comes back to its start after a survey, and goes to the outlet without one.
     """
 
-    phases: tuple[PhaseName, ...] = PHASES
+    phases: tuple[PhaseName, ...] = PHASES  # in order; observe is alone
+    # where the robot is at the beginning; on a lab's rig it is seen, and this is where it is looked for
     start: Place = "inlet"
-    goal: Place = "outlet"
+    # None: the start after a survey, so that the robot comes back; without one the widest outlet
+    goal: Place | None = None
     # Before anything is controlled, drive the robot a little along x and y, for at most 3 s, and refuse the run if it
     # does not move as the axes of camera and coils say; see control/axes_check.py. Record, import and doctor then also
     # compare the walls in the image with the stated orientation of the chip and the scale of the camera.
@@ -76,11 +79,12 @@ class MissionStateMachine:
     # on and the flow solved before it is let go. None: 1 s in the simulated rig at an outlet that `start` names, else 0
     hold_start_s: Annotated[float, Range(0.0, 3600.0)] | None = None
     goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
-    survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0
+    survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0  # time after which a survey ends, wherever it is
     # time by which a robot may be late on its route, on top of what is usual, before it counts as stuck: a survey ends,
     # and the way to the goal is planned anew; 0: never. As long as a robot at its speed limit needs for a few widths of
     # a channel.
     stuck_s: Annotated[float, Range(0.0, 1e6)] = 5.0
+    # time after which a mission that has not reached its goal ends
     navigate_limit_s: Annotated[float, Range(0.1, 1e6)] = 300.0
     # no route is followed for longer than this factor times its planned duration, plus 5 s
     patience: Annotated[float, Range(0.1, 1e3)] = 3.0

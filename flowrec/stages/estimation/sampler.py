@@ -43,6 +43,7 @@ class Trimmed:
     """
 
     discarded_share: Annotated[float, Range(0.0, 0.49)] = 0.2  # fraction at the top, and the same at the bottom
+    # values that are compared: of a window that slides along the way, or of the whole survey
     over: Literal["window", "survey"] = "window"
     window: Annotated[int, Range(1, 1001)] = 9  # observations along the way
     degree: Annotated[int, Range(0, 9)] = 2  # of the polynomial in the distance travelled

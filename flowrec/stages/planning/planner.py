@@ -89,7 +89,7 @@ class PlanningMethod(Protocol):
 class RrtSettings:
     """Settings of both trees."""
 
-    seed: Seed = 0
+    seed: Seed = 0  # of the branches
     iterations: Annotated[int, Range(1, 100_000_000)] = 20000  # at most; rrt stops at its first path
     range_px: Annotated[float, Range(0.1, 1e5)] = 12.0  # longest branch
     goal_bias: Share = 0.05  # fraction of the samples that are the goal itself
@@ -100,7 +100,7 @@ class Planner:
     """Settings of all methods; a method reads those that its row in PLANNERS names, those of no row are for all."""
 
     method: Annotated[str, PLANNERS] = "time_field"
-    cost: Literal["time", "energy"] = "time"
+    cost: Literal["time", "energy"] = "time"  # what a route has least of; energy counts the swimming and the time
     # swimming at this speed takes as much power as everything else; None: half of V
     idle_speed_um_s: Annotated[float, Range(0.01, 1e6)] | None = None
     # kept from the walls beside the robot's radius; None: half of it

@@ -62,7 +62,7 @@ class SurveyPlanner:
     # Of `information`: other ratios to the speed limit at which a stretch may be travelled. A drift observes the flow
     # almost without the robot's own motion, so it is tried only where constants of the robot are in doubt.
     fast_share: PositiveShare = 0.85
-    drift_share: PositiveShare = 0.15
+    drift_share: PositiveShare = 0.15  # likewise, where constants of the robot are in doubt
     # Of the squared error that is to be lowered, the part that counts on the ways to the goal; the rest is the map's.
     route_share: Share = 0.5
     # A way to the goal that takes longer than the fastest by this ratio counts for a third of it.

@@ -89,13 +89,13 @@ class NetworkSettings:
     # iterations times pixels in millions: larger fields get fewer iterations
     largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 4.0
     patience: Iterations = 25  # iterations without a better loss before it stops
-    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3  # of Adam
     observation_weight: Weight = 0.03  # of the mean log-likelihood against the mean squared residual
     base_channels: Annotated[int, Range(1, 512)] = 16  # of the network with random weights
-    device: Device = "cpu"
+    device: Device = "cpu"  # that trains the network
     # More than one only on idle cores: torch's threads wait actively, and on two shared cores two are ten times slower.
     threads: Threads = 1
-    seed: Seed = 0
+    seed: Seed = 0  # of the initial weights
 
 
 class FieldLoss:

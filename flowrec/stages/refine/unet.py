@@ -25,8 +25,8 @@ class Unet:
     """Settings of the data-driven U-Net."""
 
     weights: str = ""  # path of a .safetensors file; '' for those that are shipped
-    device: Device = "cpu"
-    threads: Threads = 1
+    device: Device = "cpu"  # that applies the network
+    threads: Threads = 1  # of the processor
 
     @property
     def path(self) -> Path:

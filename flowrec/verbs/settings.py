@@ -1,0 +1,74 @@
+"""`flowrec settings`: meaning, unit, range and default of each setting."""
+
+import difflib
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flowrec.core import UsageError
+from flowrec.verbs.command import verb
+
+if TYPE_CHECKING:
+    from flowrec.stages import SettingRow
+
+
+class ExplainedSettings(tuple["SettingRow", ...]):
+    """Settings, a row each."""
+
+    __slots__ = ()
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """For JSON."""
+        return [asdict(row) for row in self]
+
+    def lines(self) -> list[str]:
+        """As text."""
+        return [line for row in self for line in row.lines()]
+
+
+class SettingSections(dict[str, str]):
+    """Subjects of the sections of the settings, by name."""
+
+    def as_json(self) -> dict[str, str]:
+        """For JSON."""
+        return dict(self)
+
+    def show(self) -> None:
+        """Print them as a table."""
+        from flowrec.core import table
+
+        table("Settings", ("section", "what it is about"), self.items(), text="what it is about")
+        typer.echo("flowrec settings SECTION explains its settings; record --dry-run prints those of a run")
+
+
+@verb("flowrec settings", "flowrec settings plan", "flowrec settings mission.goal")
+def settings(
+    about: Annotated[
+        str | None, typer.Argument(metavar="[SECTION|KEY]", help="Explain this setting, or all of a section.")
+    ] = None,
+) -> "ExplainedSettings | SettingSections":
+    """Explain the settings: meaning, unit, range, default, and the methods that read each.
+
+    Raises
+    ------
+    UsageError : there is no such setting.
+    """
+    from flowrec.stages import Config, section_summary, setting_rows
+
+    rows = [*setting_rows()]
+    if about is None:
+        from flowrec.core import hints
+
+        sections = {row.key.partition(".")[0] for row in rows if "." in row.key}
+        kinds = {name: kind for name, kind in hints(Config).items() if name in sections}
+        single = ", ".join(row.key for row in rows if "." not in row.key)
+        return SettingSections({name: section_summary(kind) for name, kind in kinds.items()} | {single: "of the whole run"})
+    found = [row for row in rows if row.key == about or row.key.startswith(f"{about}.")]
+    if not found:
+        keys = [row.key for row in rows]
+        names = sorted({key[:end] for key in keys for end in (len(key), key.rfind("."), key.find(".")) if end > 0})
+        by_name = [key for key in keys if key.rpartition(".")[2] == about.rpartition(".")[2]]
+        near = by_name[:3] or difflib.get_close_matches(about, names, 3, 0.5) or ["plan", "mission"]
+        raise UsageError(f"{about}: no such setting; did you mean {' or '.join(near)}? flowrec settings lists all")
+    return ExplainedSettings(found)

@@ -1,0 +1,59 @@
+"""Each setting is explained, by the comment of its declaration; what `record --dry-run` prints makes the same run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flowrec.core.errors import UsageError
+from flowrec.physics.chip.io import load_chip
+from flowrec.stages.config import load_config
+from flowrec.stages.resolve import resolve
+from flowrec.stages.setting_rows import commented_toml, setting_rows
+from flowrec.verbs.settings import settings
+
+ROWS = {row.key: row for row in setting_rows()}
+
+
+def test_every_setting_states_what_it_means_and_what_is_valid() -> None:
+    assert len(ROWS) > 390
+    assert [key for key, row in ROWS.items() if not row.meaning] == []
+    assert [key for key, row in ROWS.items() if not row.facts] == []
+
+
+def test_the_meaning_of_a_setting_is_the_comment_at_its_own_declaration() -> None:
+    assert ROWS["plan.speed_share"].meaning == "ratio to the robot's speed limit; the rest is left to the controller"
+    assert ROWS["plan.idle_speed_um_s"].meaning.startswith("swimming at this speed takes as much power")
+    assert (ROWS["robot.delay_s"].unit, ROWS["robot.delay_s"].valid) == ("s", "number from 0 to 10")
+    assert ROWS["plan.policy_share"].read_by == ("time_field",) and ROWS["plan.speed_share"].read_by == ()
+
+
+@pytest.mark.parametrize("changed_only", [False, True])
+def test_a_printed_configuration_read_back_is_that_configuration(tmp_path: Path, changed_only: bool) -> None:
+    sets = [
+        "mission.goal=[4400.0, 1500.0]",
+        "plan.method=astar_paper",
+        "simulated.world=kind",
+        'recording.notes="a # b"',
+    ]
+    asked = load_config(None, sets)
+    file = tmp_path / "printed.toml"
+    file.write_text(commented_toml(asked, changed_only), encoding="utf-8")
+    assert load_config(file) == asked
+    resolved = resolve(asked, load_chip(asked.chip))
+    file.write_text(commented_toml(resolved), encoding="utf-8")
+    again = load_config(file)
+    assert resolve(again, load_chip(again.chip)) == resolved
+
+
+def test_only_what_differs_from_the_defaults_is_printed_in_short() -> None:
+    text = commented_toml(load_config(None, ["plan.method=astar_paper"]), changed_only=True)
+    assert [line for line in text.splitlines() if not line.startswith("#")] == ["[plan]", 'method = "astar_paper"']
+
+
+def test_a_misspelt_setting_is_answered_with_the_nearest() -> None:
+    with pytest.raises(UsageError, match=r"did you mean .*plan\.speed_share"):
+        settings("speed_share")
+    with pytest.raises(UsageError, match="did you mean mission"):
+        settings("mision")
