@@ -9,6 +9,7 @@ from .store.session import Session as Session
 from .store.session import open as open
 from .verbs.check import check as check
 from .verbs.compare import compare as compare
+from .verbs.cut import cut as cut
 from .verbs.export import export as export
 from .verbs.import_movie import import_movie as import_movie
 from .verbs.info import info as info

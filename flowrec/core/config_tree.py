@@ -195,8 +195,13 @@ def refuse_unknown(
     for key, value in tree.items():
         name = prefix + key
         if key not in known:
-            near = difflib.get_close_matches(name, [each for each, _ in _all_hints(root)], n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + each for each in known)}"
+            keys = [each for each, _ in _all_hints(root)]
+            near = [each for each in keys if each.rpartition(".")[2] == key] if section is None else []
+            near = near[:3] or difflib.get_close_matches(name, keys, n=1, cutoff=0.6)
+            all_of = (
+                f"known here: {', '.join(prefix + each for each in known)}" if prefix else "flowrec settings lists all"
+            )
+            hint = f"did you mean {' or '.join(near)}?" if near else all_of
             raise UsageError(f"{origin(name)}: unknown key {name}; {hint}")
         inner = known[key]
         if is_dataclass(inner) and isinstance(inner, type):

@@ -17,7 +17,7 @@ import av.logging
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Image, MovieError, pixel_type
+from flowrec.core import MCAP, NS_PER_S, Image, MovieError, pixel_type
 from flowrec.movies.grey import CHANNELS, refuse_colour
 from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, checked_size
 from flowrec.movies.notes import notes_in, refuse_drawn
@@ -238,9 +238,10 @@ def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
     try:
         container = av.open(str(path), options={"err_detect": "explode"})
     except (av.FFmpegError, OSError) as error:
-        raise MovieError(
-            f"{path}: is no movie that can be read ({_text(error)}); if it was cut short, ffmpeg may repair it"
-        ) from error
+        remedy = "if it was cut short, ffmpeg may repair it"
+        if path.suffix == MCAP[0]:
+            remedy = f"a session is replayed: flowrec replay {path} --refine"
+        raise MovieError(f"{path}: is no movie that can be read ({_text(error)}); {remedy}") from error
     with container:
         stream = container.streams.best("video")
         if stream is None:

@@ -24,6 +24,7 @@ from flowrec.verbs.calibrate import calibrate
 from flowrec.verbs.check import check
 from flowrec.verbs.command import add_verb, outside_verb
 from flowrec.verbs.compare import compare
+from flowrec.verbs.cut import cut
 from flowrec.verbs.doctor import doctor
 from flowrec.verbs.export import export
 from flowrec.verbs.import_movie import import_movie
@@ -107,7 +108,7 @@ add_verb(app, replay)
 add_verb(app, import_movie, "import")
 for _verb in (
     *map(from_above, ("sweep", "push", "catalog", "find")),
-    *(settings, methods, new, doctor, view, export, report, info, ls, note, check, sign, recover, compare),
+    *(settings, methods, new, doctor, view, export, report, cut, info, ls, note, check, sign, recover, compare),
 ):
     add_verb(app, _verb)
 OUR_VERBS.update(str(each.name) for each in app.registered_commands)
@@ -139,7 +140,8 @@ def main() -> None:
         if type(error).__name__ == "NoArgsIsHelpError":  # typer has moved the class from version to version
             typer.echo(error.ctx.get_help())
             sys.exit(0)
-        message = printable(error.format_message()).rstrip(".")
+        # Of a choice it is in several lines; of a value that pydantic has refused it begins with its own words.
+        message = printable(" ".join(error.format_message().split()).replace("Value error, ", "")).rstrip(".")
         if message:  # empty if the help was printed
             verb = error.ctx.command_path if error.ctx is not None else "flowrec"
             sys.stderr.write(f"flowrec: {message}; see {verb} --help\n")

@@ -8,7 +8,7 @@ import typer
 
 from flowrec.core import UsageError
 from flowrec.verbs.command import verb
-from flowrec.verbs.options import Sets
+from flowrec.verbs.options import Sets, readable_toml
 
 if TYPE_CHECKING:
     from flowrec.stages import Config
@@ -49,7 +49,9 @@ class Diagnosis:
 
 @verb("flowrec doctor lab.toml")
 def doctor(
-    config: Annotated[Path | None, typer.Argument(help="Configuration (TOML) of the lab.")] = None,
+    config: Annotated[
+        Path | None, typer.Argument(callback=readable_toml, help="Configuration (TOML) of the lab; else flowrec.toml.")
+    ] = None,
     rig: Annotated[str | None, typer.Option(help="Rig to look at: lab.")] = None,
     sets: Sets = None,
     folder: Annotated[

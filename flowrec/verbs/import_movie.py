@@ -31,7 +31,9 @@ def import_movie(
         typer.Argument(help="Movie: AVI, MP4, MKV, MOV, TIFF, ND2, OME-Zarr, or a folder of images."),
     ],
     out: SessionOut = None,
-    config: Annotated[AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML).")] = None,
+    config: Annotated[
+        AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML); else flowrec.toml here.")
+    ] = None,
     *,
     coils: Annotated[
         Path | str | None,

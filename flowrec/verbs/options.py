@@ -22,8 +22,16 @@ if TYPE_CHECKING:
 AnySession = Union[Path, str, "Session"]
 
 
+OF_FOLDER = Path("flowrec.toml")  # a configuration that is used where none is named
+
+
 def readable_toml(file: Path | None) -> Path | None:
-    """Return the file; refuse one that is no TOML, before imports that take a second."""
+    """Return the file, or that of the folder; refuse one that is no TOML, before imports that take a second."""
+    if file is None and OF_FOLDER.is_file():
+        from flowrec.core import say
+
+        say(f"{OF_FOLDER}: its settings are used")
+        file = OF_FOLDER
     if file is not None:
         from flowrec.core import read_toml
 

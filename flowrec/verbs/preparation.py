@@ -184,8 +184,8 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
         if Phase.SURVEY in config.mission.phases and np.array_equal(start, goal) and flow_um_s > robot.speed_limit_um_s:
             raise UnreachableError(
                 f"unreachable: from the survey the robot can not come back to its start {goal[0]:.0f},{goal[1]:.0f} "
-                f"um: the flow there is {flow_um_s:.0f} um/s, and it swims at {robot.speed_limit_um_s:.0f} um/s at most; "
-                "give another goal, as in --goal outlet"
+                f"um: the flow there is {flow_um_s:.0f} um/s, and it swims at {robot.speed_limit_um_s:.0f} um/s at "
+                "most; give another goal, as in --goal outlet"
             )
     reason = swept_out(chip, field, start, course_error, 0.0 if config.mission.hold_start_s else config.coils.ramp_s)
     if reason:

@@ -60,7 +60,7 @@ def _record_told(_asked: Asked, done: "Recorded | DryRun") -> Told:
 )
 def record(
     config: Annotated[
-        AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML); --dry-run prints one.")
+        AsConfig, typer.Argument(callback=readable_toml, help="Configuration (TOML); else flowrec.toml of this folder.")
     ] = None,
     out: SessionOut = None,
     view: Annotated[View, typer.Option(help="Watch live (spawn, serve) or write an .rrd at the end.")] = "none",

@@ -63,7 +63,9 @@ def settings(
         sections = {row.key.partition(".")[0] for row in rows if "." in row.key}
         kinds = {name: kind for name, kind in hints(Config).items() if name in sections}
         single = ", ".join(row.key for row in rows if "." not in row.key)
-        return SettingSections({name: section_summary(kind) for name, kind in kinds.items()} | {single: "of the whole run"})
+        return SettingSections(
+            {name: section_summary(kind) for name, kind in kinds.items()} | {single: "of the whole run"}
+        )
     found = [row for row in rows if row.key == about or row.key.startswith(f"{about}.")]
     if not found:
         keys = [row.key for row in rows]

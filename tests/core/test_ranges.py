@@ -144,7 +144,7 @@ def test_a_recorded_setting_outside_of_its_range_may_stay_but_not_be_set() -> No
             ["record", "--rig", "simulatd"],
             "--rig: rig = 'simulatd': must be one of simulated",
         ),
-        (["record", "--seed", "-1"], "--seed: simulated.seed = -1: must be from 0 to"),
+        (["record", "--seed", "-1"], "--seed: simulated.seed = -1: must be from 0;"),
         (["record", "--duration", "-2"], "--duration: duration_s = -2: must be from 0.001"),
         (["record", "--duration", "nan"], "--duration: duration_s = nan: must be from 0.001"),
         (["record", "--goal", "nan,100"], "--goal: mission.goal = nan: must be from"),

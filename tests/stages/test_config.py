@@ -169,6 +169,37 @@ def test_a_goal_that_is_found_unreachable_before_the_run_fails_as_one_found_duri
     assert (status, line[:22]) == (1, "flowrec: unreachable: ")
 
 
+@pytest.mark.parametrize(
+    ("sets", "goal"),
+    [
+        ([], "start"),
+        (["mission.start=[4400.0, 1500.0]"], "start"),
+        (["mission.phases=plan,navigate"], "outlet"),
+        (["mission.goal=outlet"], "outlet"),
+    ],
+)
+def test_a_robot_without_a_goal_comes_back_from_a_survey_and_goes_to_the_outlet_without_one(
+    sets: list[str], goal: str
+) -> None:
+    config = load_config(None, sets)
+    chip = load_chip(config.chip)
+    mission = resolve(config, chip).mission
+    outlet = resolve(with_sets(config, ["mission.goal=outlet"]), chip).mission.goal
+    assert mission.goal == (mission.start if goal == "start" else outlet) and mission.start != outlet
+
+
+def test_the_configuration_of_the_folder_is_used_where_none_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "flowrec.toml").write_text('[plan]\nmethod = "astr"\n', encoding="utf-8")
+    (tmp_path / "other.toml").write_text("[plan]\nspeed_share = 7.0\n", encoding="utf-8")
+    status, line = run_main(["record", "--dry-run"], monkeypatch, capsys)
+    assert status == 2 and line.startswith("flowrec: flowrec.toml: plan.method = 'astr'")
+    status, line = run_main(["record", "other.toml", "--dry-run"], monkeypatch, capsys)
+    assert status == 2 and line.startswith("flowrec: other.toml: plan.speed_share = 7")
+
+
 def test_a_goal_in_another_channel_is_unreachable() -> None:
     config = load_config(None, ["chip.name=straight", "robot.max_speed_um_s=600", "mission.goal=outlet"])
     chip = load_chip(config.chip)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +42,27 @@ def test_downstream_the_robot_takes_the_short_fast_branch(mission: Recorded) -> 
     assert np.all(rows > ISLAND_ROW_UM)
 
 
+def test_the_end_of_a_mission_tells_its_outcome_its_way_what_was_won_and_where_the_file_is(mission: Recorded) -> None:
+    facts = mission.facts
+    assert facts["shortest_way_um"] <= 1.01 * facts["route_length_um"]
+    assert facts["shortest_way_s"] >= 0.99 * facts["planned_s"], "no way is faster than the one in least time"
+    ended, flow, file = mission.lines()
+    assert ended.startswith("reached after ") and f"planned {facts['planned_s']:.1f} s" in ended
+    assert ended.endswith(f"would take {facts['shortest_way_s']:.1f} s")
+    assumed, refined, stated = (
+        f"{100 * facts[f'{name}_flow_error']:.1f} %" for name in ("assumed", "refined", "stated")
+    )
+    assert flow.startswith(f"flow error: assumed {assumed} (fvm), refined {refined} (assimilate)")
+    assert f"states an error of {stated}, from {facts['observations']} observations" in flow
+    assert file.startswith(f"file: {mission.path} (")
+    odd = replace(mission, facts={**facts, "shortest_way_s": None, "contacts": 2, "frames_dropped": 3}).lines()
+    assert odd[0].endswith("on the shortest way the flow is too fast for the robot")
+    assert odd[2:4] == ["wall contacts: 2", "frames dropped: 3"]
+
+
 @pytest.fixture(scope="module")
 def upstream(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    asked = load_config(SESSIONS / "upstream.toml", SMALL)
+    asked = load_config(SESSIONS / "upstream.toml", [*SMALL, "mission.goal=inlet"])
     return made_once(tmp_path_factory, "upstream", lambda folder: record(asked, folder / "upstream.mcap"))
 
 
@@ -54,6 +73,9 @@ def test_upstream_it_takes_the_long_slow_branch_and_arrives(upstream: Recorded) 
     rows = rows_where_it_swam(upstream)
     assert len(rows) > 5
     assert np.all(rows < ISLAND_ROW_UM)
+    facts = upstream.facts
+    assert facts["shortest_way_um"] < facts["route_length_um"]
+    assert facts["shortest_way_s"] > 1.2 * facts["planned_s"], "the direct way is the wrong one"
 
 
 @pytest.mark.slow("replays a mission with another planner and flies both routes")

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import flowrec
+from flowrec.core.system import numba_setup
 from flowrec.core.system.numba_setup import kernel_files
 
 PACKAGE = Path(flowrec.__file__).parent
@@ -103,6 +104,20 @@ def test_the_folder_that_numba_was_told_is_used_and_what_nobody_has_used_for_lon
     assert not old.exists()
     assert recent.exists() and other.exists()
     assert len(list(told.iterdir())) == 3
+
+
+def test_kernels_count_as_cached_from_when_a_rehearsal_has_kept_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for place, kept in ((tmp_path / "cache", True), (None, False)):
+        monkeypatch.setattr(numba_setup, "_places", lambda place=place: iter([place] if place else []))
+        numba_setup._cache_folder.cache_clear()
+        try:
+            assert not numba_setup.kernels_cached()
+            numba_setup.keep_kernels()
+            assert numba_setup.kernels_cached() == kept, "where nothing can be written, each process compiles"
+        finally:
+            numba_setup._cache_folder.cache_clear()
 
 
 def test_kernels_take_from_other_files_only_what_the_key_of_the_cache_knows() -> None:
