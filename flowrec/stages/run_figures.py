@@ -77,7 +77,7 @@ def figures_of(
         figures["contacts"] = contacts
     for name in FLOW_FIELDS:
         flow: FlowField | None = getattr(last, name)
-        if flow is not None:
+        if flow is not None and (true_field is not None or not flow.refused or flow.log_score is not None):
             figures[f"{name}_method"] = f"{flow.method}, another refused" if flow.refused else flow.method
         if flow is not None and true_field is not None:
             figures[f"{name}_flow_error"] = flow_error(chip, flow, true_field)

@@ -132,7 +132,7 @@ def _valid(hint: Any) -> str:
         if isinstance(part, type) and issubclass(part, StrEnum):
             return "of " + ", ".join(part)
     valid = range_of(hint)
-    several = "s" if tuple in map(get_origin, parts) else ""
+    several = "s" if any(get_origin(part) is tuple for part in parts) else ""
     names = {bool: "true or false", str: f"text{several}", int: f"whole number{several}", float: f"number{several}"}
     kind = " or ".join(text for each, text in names.items() if each in parts)
     return " ".join(filter(None, (kind, str(valid or ""))))

@@ -120,7 +120,7 @@ def test_a_map_that_is_refined_again_on_the_way_is_surer_and_replays(tmp_path: P
 
 @pytest.mark.slow("flies a mission downstream")
 def test_a_robot_slower_than_the_flow_says_that_it_can_not_go_back(tmp_path: Path) -> None:
-    sets = [*SMALL, "robot.max_speed_um_s=150"]
+    sets = [*SMALL, "robot.max_speed_um_s=150", "mission.goal=[500.0, 2700.0]"]
     recorded = record(load_config(SESSIONS / "upstream.toml", sets), tmp_path / "slow.mcap")
     assert recorded.report.outcome == "unreachable"
     assert "too fast" in recorded.report.note
