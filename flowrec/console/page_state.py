@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowrec.core import Floats, Phase, Tick, printable, seconds, shift_px
+from flowrec.core import Floats, Phase, Tick, printable, seconds, shift_px, with_micro
 from flowrec.view import Batch, Scene, encode_jpeg, goal_of, state_text, way_of
 
 # What the page shows depends on these fields of a tick.
@@ -45,7 +45,9 @@ class PageState:
             self.tick = replace(self.tick, **changes)
             event = changes.get("event")
             if event is not None:
-                events.append({"s": round(seconds(event.stamp_ns), 2), "level": event.level, "text": event.text})
+                events.append(
+                    {"s": round(seconds(event.stamp_ns), 2), "level": event.level, "text": with_micro(event.text)}
+                )
         self._step, self.remarks = batch.step, batch.remarks
         return events
 

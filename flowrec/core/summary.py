@@ -18,6 +18,7 @@ _UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns
 _WHOLE = ("_bytes", "_ns")
 _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
+_UM = re.compile(r"(?<![\w.])um\b")
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
 DOUBTS = "doubts"  # key of the outcome of a session: why its result is doubtful; absent: it is not
 # Names of keys that would be misread as words.
@@ -26,6 +27,7 @@ _NAMES = {
     "contacts": "wall contacts",
     "planned_s": "planned time",
     "navigation_s": "navigation time",
+    "shortest_way_s": "time of shortest way",
     "observations": "flow observations",
     "assumed_method": "assumed flow",
     "refined_method": "refined flow",
@@ -101,6 +103,11 @@ def text_of_figure(key: str, value: Value) -> str:
     if suffix == "_um" and abs(value) >= 1000:
         return f"{value / 1000:.2f} mm"
     return f"{value:.1f} {_UNITS[suffix]}"
+
+
+def with_micro(text: str) -> str:
+    """Text for a picture or a page: um, as a terminal and a file may have it, spelt as the axes of plots are."""
+    return _UM.sub("µm", text)
 
 
 def is_numeric(key: str) -> bool:

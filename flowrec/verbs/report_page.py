@@ -23,6 +23,7 @@ from flowrec.core import (
     progress,
     say,
     text_of_figure,
+    with_micro,
 )
 from flowrec.exports import (
     GLOSSARY,
@@ -62,6 +63,7 @@ from flowrec.verbs.verdict import Verdict
 _HIDDEN = frozenset(  # of the outcome: shown elsewhere
     {
         "outcome",
+        "stated_flow_error",  # of each map is
         "note",
         "reason",
         DOUBTS,
@@ -238,7 +240,9 @@ def _key_figures(data: ReportData) -> ReportTable:
         error = flow_error(data.scene.chip, field, data.truth)
         if error is not None:  # of a run that was cut off, its last tick instead of its figures
             figures.setdefault(f"{name}_flow_error", error)
-    rows = [(name_of(key), _micro(text_of_figure(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
+    rows = [
+        (name_of(key), with_micro(text_of_figure(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()
+    ]
     for name, field in _maps(data).items():
         if field.error_share is not None:
             text = text_of_figure("_error", field.error_share)
@@ -246,11 +250,6 @@ def _key_figures(data: ReportData) -> ReportTable:
     if data.truth is None:
         rows.append(("error of the flow", "-", "not known: only a simulation knows the true flow"))
     return ReportTable("In numbers", rows, ("", "", ""))
-
-
-def _micro(text: str) -> str:
-    """A number with its unit, spelt as on the figures."""
-    return text.replace(" um", " µm")
 
 
 def _boundary(data: ReportData) -> ReportTable | None:
@@ -288,10 +287,11 @@ def _refinement(data: ReportData) -> list[str]:
 def _events(data: ReportData) -> list[ReportTable]:
     history = data.history
     actions = [
-        (number, f"{each.time_s:.2f} s", each.action, each.text) for number, each in numbered_actions(history.remarks)
+        (number, f"{each.time_s:.2f} s", each.action, with_micro(each.text))
+        for number, each in numbered_actions(history.remarks)
     ]
     events = [
-        (f"{each.time_s:.2f} s", each.text if each.level == Level.INFO else f"{each.level}: {each.text}")
+        (f"{each.time_s:.2f} s", with_micro(each.text if each.level == Level.INFO else f"{each.level}: {each.text}"))
         for each in history.remarks
         if not each.action
     ]
@@ -321,7 +321,12 @@ def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]
 
 def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
     texts = [
-        (name_of(key), _micro(text_of_figure(key, was)), _micro(text_of_figure(key, now)), MEANINGS.get(key, ""))
+        (
+            name_of(key),
+            with_micro(text_of_figure(key, was)),
+            with_micro(text_of_figure(key, now)),
+            MEANINGS.get(key, ""),
+        )
         for key, was, now in before_after(pair)
     ]
     changed = _changed_settings(pair)

@@ -27,7 +27,7 @@ _FEW_LANES, _MOST_LANES = 2, 5  # more than few make the area below higher; more
 _MOST_EXTRA = 6  # plots of extra topics beside each other
 _TITLE_PX = 28.0
 _LEGEND_LIVE_S = 6.0  # least time kept free for a legend in a view that follows the run
-LEGEND = 0.5  # of the time shown, kept free for a legend beside the curves
+LEGEND = 0.35  # of the time shown, kept free for a legend beside the curves, in all plots alike
 Shown = rrb.View | rrb.Container
 Part = Shown | None
 
@@ -105,7 +105,7 @@ class _Views:
             origin=paths[0] if len(paths) == 1 else "/",
             contents=_contents(paths),
             plot_legend=legend_of(visible=legend),
-            axis_x=self._time_axis() if legend else None,
+            axis_x=self._time_axis(),
         )
 
     def _time_axis(self) -> rrb.TimeAxis:

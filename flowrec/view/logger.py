@@ -24,6 +24,7 @@ from flowrec.core import (
     Timing,
     message_fields,
     seconds,
+    with_micro,
 )
 from flowrec.physics import sample
 from flowrec.view import colours, maps
@@ -246,4 +247,4 @@ class TickLogger:
     def _log_text(self, entity: str, text: str, level: str) -> None:
         # The time is in the text: a column of the view shows it to the nanosecond.
         whose = f"{self._entities.prefix}: " if self._entities.prefix else ""
-        self._log(entity, rr.TextLog(f"{seconds(self._tick.stamp_ns):.1f} s  {whose}{text}", level=level))
+        self._log(entity, rr.TextLog(f"{seconds(self._tick.stamp_ns):.1f} s  {whose}{with_micro(text)}", level=level))

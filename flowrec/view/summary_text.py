@@ -18,6 +18,7 @@ from flowrec.core import (
     doubts_text,
     printable,
     seconds,
+    with_micro,
 )
 from flowrec.physics import on_chip
 from flowrec.stages import MotionOfRun, RunStatistics, TrackQuality, figures_of
@@ -30,11 +31,11 @@ FIGURES = (
     "outcome",
     "duration_s",
     "covered",  # of a replay or an import
-    "axes_check",
     "assumed_flow_error",
     "refined_flow_error",
-    "planned_s",
+    "stated_flow_error",
     "navigation_s",
+    "planned_s",
     "tracking_error_um",
     "contacts",
     "frames_dropped",
@@ -57,11 +58,12 @@ def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Itera
 
 
 def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
-    """Goal and figures of one run; those that are not known are left out."""
+    """Outcome, goal and figures of one run; those that are not known are left out."""
     goal_um = goal_of(last.mission)
     goal: Row = ("goal", "none" if goal_um is None else f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um", None)
     known = [key for key in FIGURES if figures.get(key) not in (None, "")]
-    return [goal, *((key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO)]
+    rows: list[Row] = [(key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO]
+    return [*rows[:1], goal, *rows[1:]] if "outcome" in known else [goal, *rows]
 
 
 def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.TextDocument:
@@ -142,4 +144,4 @@ def registration_remark(refined: FlowField | None) -> str:
 
 def _cell(text: str) -> str:
     """Text as it is, without Markdown, HTML or control characters."""
-    return printable(text)[:_LETTERS].translate(_MARKDOWN)
+    return with_micro(printable(text))[:_LETTERS].translate(_MARKDOWN)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from flowrec.core.summary import of_text
+from flowrec.core.summary import of_text, with_micro
 from flowrec.store.reader import SessionReader
 from flowrec.store.session import Session
 from flowrec.verbs.cli import main
@@ -123,3 +123,8 @@ def test_a_new_file_holds_the_count_of_dropped_frames_once_and_readers_take_the_
     assert Session(session).outcome["frames_dropped"] == 0
     for older in ({"frames_dropped": "3"}, {"dropped_frames": "3"}, {"frames_dropped": "1", "dropped_frames": "3"}):
         assert of_text(older) == {"frames_dropped": 3}
+
+
+def test_pictures_and_pages_spell_micrometres_as_axes_do_and_leave_names_alone() -> None:
+    assert with_micro("(240, 2700) um, 15.5 um/s, um per revolution") == "(240, 2700) µm, 15.5 µm/s, µm per revolution"
+    assert with_micro("robot.radius_um = 3, sum, um_per_px, a.um") == "robot.radius_um = 3, sum, um_per_px, a.um"
