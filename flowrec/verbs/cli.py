@@ -29,6 +29,7 @@ from flowrec.verbs.doctor import doctor
 from flowrec.verbs.export import export
 from flowrec.verbs.import_movie import import_movie
 from flowrec.verbs.info import info
+from flowrec.verbs.init import init
 from flowrec.verbs.ls import ls
 from flowrec.verbs.methods import methods
 from flowrec.verbs.new import new
@@ -108,7 +109,7 @@ add_verb(app, replay)
 add_verb(app, import_movie, "import")
 for _verb in (
     *map(from_above, ("sweep", "push", "catalog", "find")),
-    *(settings, methods, new, doctor, view, export, report, cut, info, ls, note, check, sign, recover, compare),
+    *(init, settings, methods, new, doctor, view, export, report, cut, info, ls, note, check, sign, recover, compare),
 ):
     add_verb(app, _verb)
 OUR_VERBS.update(str(each.name) for each in app.registered_commands)

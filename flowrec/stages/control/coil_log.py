@@ -18,6 +18,9 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +38,27 @@ _FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
 _TURNS = ("turns_x", "turns_y", "amplitude_mt")
 _KINDS = (_TURNS, _ROTATING, _IN_RADIANS, _FIELDS, _CURRENTS)
 _LARGEST_STEP_RAD = 2.0 * math.pi / 3.0
+# Units in brackets at the end of a column's name, and what such a column holds.
+_BY_UNIT = {
+    **{"s": "time_s", "hz": "frequency_hz", "mt": "amplitude_mt", "rad": "heading_rad"},
+    **dict.fromkeys(("deg", "degrees", "\u00b0"), "heading_deg"),
+}
+_UNIT = re.compile(r"[(\[]\s*([^()\[\]]+?)\s*[)\]]\s*$")
 _OFF = 0.05  # of the largest amplitude: below it a sampled field is noise, and has no direction
+
+
+def columns_by_unit(header: Sequence[str]) -> dict[str, str]:
+    """Columns of a log of a rotating field under other names, by the units in these: settings of movie.columns.
+
+    A unit that two columns have tells nothing.
+
+    >>> columns_by_unit(["t (s)", "f [Hz]", "x (um)"])
+    {'time_s': 't (s)', 'frequency_hz': 'f [Hz]'}
+    """
+    units = [match[1].lower() if (match := _UNIT.search(name)) else "" for name in header]
+    named = {_BY_UNIT[unit]: name for name, unit in zip(header, units, strict=True) if unit in _BY_UNIT}
+    count = Counter(_BY_UNIT.get(unit, "") for unit in units)
+    return {key: name for key, name in named.items() if count[key] == 1 and key not in header}
 
 
 def read_coil_log(
