@@ -53,7 +53,7 @@ class SettingRow:
             "; ".join([self.facts, *([f"read by {', '.join(self.read_by)}"] if self.read_by else [])]),
         ]
         lines = [line for text in told for line in textwrap.wrap(text, _WIDTH)]
-        return [f"{self.key} = {shown_value(self.default)}", *(f"    {line}" for line in lines)]
+        return [f"{self.key} = {toml_value(self.default)}", *(f"    {line}" for line in lines)]
 
     @property
     def facts(self) -> str:
@@ -83,12 +83,12 @@ def section_summary(section: type) -> str:
     return " ".join((inspect.getdoc(section) or "").split("\n\n")[0].split())
 
 
-def shown_value(value: Any) -> str:
+def toml_value(value: Any) -> str:
     """A value as TOML writes it; `(not set)` for None."""
     if value is None:
         return "(not set)"
     if isinstance(value, tuple | list):
-        return f"[{', '.join(map(shown_value, value))}]"
+        return f"[{', '.join(map(toml_value, value))}]"
     return tomli_w.dumps({"value": value}).partition("= ")[2].rstrip()
 
 
@@ -104,10 +104,10 @@ def commented_toml(config: Config, changed_only: bool = False) -> str:
         told: list[str] = []
         for name, value in values.items():
             row = rows.get(prefix + name)
-            if row is not None and changed_only and shown_value(row.default) == shown_value(value):
+            if row is not None and changed_only and toml_value(row.default) == toml_value(value):
                 continue
             about = f"{row.meaning} ({row.facts})" if row is not None else ""
-            told += [*(f"# {line}" for line in textwrap.wrap(about, _WIDTH)), f"{name} = {shown_value(value)}"]
+            told += [*(f"# {line}" for line in textwrap.wrap(about, _WIDTH)), f"{name} = {toml_value(value)}"]
         if told:
             lines += [*([f"\n[{section}]"] if section else []), *told]
     return "\n".join(lines).lstrip("\n") + "\n"

@@ -34,7 +34,7 @@ class StartedConfig(NamedTuple):
         return {name: None if value is None else str(value) for name, value in self._asdict().items()}
 
     def lines(self) -> list[str]:
-        """What was made, and what to do next."""
+        """The files that were made, and the next command."""
         mask = self.chip.with_suffix(".png")
         named = "" if self.path == OF_FOLDER else f" {self.path}"
         return [
@@ -88,9 +88,11 @@ def init(
     with open_movie(movie) as opened:
         facts = opened.facts
     say(f"{movie}: {facts.describe()}")
-    given = dict(zip(_QUESTIONS, (um_per_px or facts.um_per_px, radius_um, inlet, inlet_speed_um_s), strict=True))
+    given: dict[str, Any] = dict(
+        zip(_QUESTIONS, (um_per_px or facts.um_per_px, radius_um, inlet, inlet_speed_um_s), strict=True)
+    )
     if missing := [option for option, value in given.items() if not value]:
-        given |= _asked(missing, calibrate_chip(movie), out.with_name(f"{movie.stem}_openings.png"), overwrite)
+        given |= _ask(missing, calibrate_chip(movie), out.with_name(f"{movie.stem}_openings.png"), overwrite)
     scale, radius, inlets, speed = given.values()
     chip = out.with_name(f"{movie.stem}_chip.toml")
     calibrate_chip(movie, chip, scale, inlets=inlets, inlet_speed_um_s=speed, overwrite=overwrite)
@@ -104,7 +106,7 @@ def init(
     return StartedConfig(movie, out, chip, coils)
 
 
-def _asked(missing: list[str], found: "PictureChip", picture: Path, overwrite: bool) -> dict[str, Any]:
+def _ask(missing: list[str], found: "PictureChip", picture: Path, overwrite: bool) -> dict[str, Any]:
     """Answers of the person at the terminal, by option; before that the openings are drawn."""
     from flowrec.core import PICTURE, Output, UsageError, say
     from flowrec.measure import draw_outline, png_of

@@ -10,6 +10,7 @@ import rerun as rr
 from flowrec.core import (
     DOUBTS,
     FLOW_FIELDS,
+    AxesVerdict,
     FlowField,
     Row,
     Tick,
@@ -31,6 +32,7 @@ FIGURES = (
     "outcome",
     "duration_s",
     "covered",  # of a replay or an import
+    "axes_check",
     "assumed_flow_error",
     "refined_flow_error",
     "stated_flow_error",
@@ -41,6 +43,7 @@ FIGURES = (
     "frames_dropped",
 )
 _AT_ZERO = ("contacts",)  # counts that are shown also where they are 0
+_USUAL = ("axes_check", AxesVerdict.AGREES)  # is not shown
 _NEWS = ("mission", "route", "drops", "true_field", *FLOW_FIELDS)  # messages that bring another fact
 
 
@@ -61,7 +64,7 @@ def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
     """Outcome, goal and figures of one run; those that are not known are left out."""
     goal_um = goal_of(last.mission)
     goal: Row = ("goal", "none" if goal_um is None else f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um", None)
-    known = [key for key in FIGURES if figures.get(key) not in (None, "")]
+    known = [key for key in FIGURES if figures.get(key) not in (None, "") and (key, figures[key]) != _USUAL]
     rows: list[Row] = [(key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO]
     return [*rows[:1], goal, *rows[1:]] if "outcome" in known else [goal, *rows]
 
