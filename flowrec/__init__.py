@@ -12,8 +12,18 @@
 Every name is imported when it is first used: `import flowrec` takes milliseconds.
 """
 
+import sys
+from typing import Any
+
 import lazy_loader
 
 from flowrec.core.version import __version__ as __version__
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return _attribute(name)
+    except AttributeError as error:  # with the module, Python adds the nearest name
+        raise AttributeError(f"flowrec has no {name!r}", name=name, obj=sys.modules[__name__]) from error

@@ -148,3 +148,31 @@ def test_a_recording_can_be_opened_by_what_record_returns(tmp_path: Path) -> Non
     recorded = flowrec.record(config, tmp_path / "short.mcap")
     assert flowrec.open(recorded.path).outcome["ticks"] == recorded.report.ticks
     assert isinstance(flowrec.record, FunctionType)
+
+
+def test_what_a_session_holds_is_printed_for_people_and_a_misspelt_name_is_answered_with_the_nearest(
+    session: Path,
+) -> None:
+    opened = flowrec.open(session)
+    shown = repr(opened.fields).splitlines()
+    assert [line.split()[0] for line in shown] == ["assumed", "refined", "true"]
+    share = opened.fields["refined"].error_share
+    assert share is not None and "flow by assimilate: 320 x 256 pixels of 20 um" in shown[1]
+    assert shown[1].endswith(f"states an error of {100 * share:.1f} %>")
+    with pytest.raises(KeyError, match="no flow field 'refind'; there are 'assumed', 'refined', 'true'"):
+        opened.fields["refind"]
+    with pytest.raises(flowrec.FlowrecError, match="no topic 'trak'; did you mean 'track'"):
+        opened.table("trak")
+    with pytest.raises(AttributeError) as caught:
+        flowrec.opne  # noqa: B018
+    assert (caught.value.name, caught.value.obj) == ("opne", flowrec), "of which Python makes: did you mean 'open'?"
+
+
+def test_every_column_of_every_table_of_a_session_is_explained(session: Path) -> None:
+    opened = flowrec.open(session)
+    told = flowrec.info(session, tables=True)
+    assert len(told.columns) == len([path for path in opened.topics if not path.startswith("/view/")])
+    for title, columns in told.columns.items():
+        name = title.partition(" ")[0]
+        assert [column.name for column in columns] == opened.table(name).column_names
+        assert [column.name for column in columns if not (column.meaning or column.unit)] == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import itertools
 import operator
@@ -168,8 +169,10 @@ class SessionReader:
         """The field of Tick of a topic, named by its field or by its path; SessionError if there is none."""
         topic = self.topics.by_field.get(name) or self.topics.by_path.get(name)
         if topic is None:
-            known = ", ".join(self.topics.by_field)
-            raise SessionError(f"{self.path}: there is no topic {name!r}; the topics are {known}")
+            known = [*self.topics.by_field, *self.topics.by_path]
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean {near[0]!r}?" if near else f"the topics are {', '.join(self.topics.by_field)}"
+            raise SessionError(f"{self.path}: there is no topic {name!r}; {hint}")
         return topic.field
 
     def rows(self, fields: Collection[str]) -> Iterator[tuple[str, Row]]:

@@ -45,6 +45,16 @@ _CARD_TEXT = 200  # characters of a value
 _LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
 
+class FlowFields(dict[str, "FlowField"]):
+    """Flow fields by name, which print as a table."""
+
+    def __missing__(self, name: str) -> FlowField:
+        raise KeyError(f"there is no flow field {name!r}; there are {', '.join(map(repr, self)) or 'none'}")
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{name:8s}  {field!r}" for name, field in self.items()) or "no flow field"
+
+
 class Session:
     """A finished session, or one finished part of a run, open for reading; it never writes.
 
@@ -214,11 +224,11 @@ class Session:
         return list(self.messages("event"))
 
     @property
-    def fields(self) -> dict[str, FlowField]:
+    def fields(self) -> FlowFields:
         """The last flow field of each kind that was recorded: "assumed", "refined" and, of a simulation, "true"."""
         last = self.reader.tick_before(self.run.last_ns, with_frames=False)
         found = {"assumed": last.assumed, "refined": last.refined, "true": last.true_field}
-        return {name: field for name, field in found.items() if field is not None}
+        return FlowFields({name: field for name, field in found.items() if field is not None})
 
     def stamp_ns(self, time_s: float, flag: str = "") -> int:
         """A time of the session in s as a stamp in ns; UsageError, which begins with `flag`, outside of the session."""

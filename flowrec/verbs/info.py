@@ -7,15 +7,18 @@ long.
 import json
 import struct
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from flowrec.core import name_of, of_text, outside_facts, seconds, text_of_figure
 from flowrec.verbs.command import verb
 from flowrec.verbs.options import SessionFile
 
 if TYPE_CHECKING:
-    from flowrec.store import Part
+    from flowrec.store import Column, Part
 
 
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
@@ -36,27 +39,42 @@ class Facts(dict[str, Any]):
     ----------
     path : of the session.
     topics : messages, by topic.
+    columns : of each table, by its name, if they were asked for.
     """
 
     path: Path
     topics: dict[str, int]
+    columns: "dict[str, tuple[Column, ...]]"
 
     def as_json(self) -> dict[str, Any]:
         """For JSON."""
-        return {"session": str(self.path), "facts": self, "topics": self.topics}
+        tables = {name: [asdict(column) for column in columns] for name, columns in self.columns.items()}
+        return {"session": str(self.path), "facts": self, "topics": self.topics} | (
+            {"tables": tables} if tables else {}
+        )
 
     def show(self) -> None:
-        """Print the known facts and the topics as tables."""
+        """Print the known facts and the topics as tables; or the columns of the tables, if these were asked for."""
         from flowrec.core import table
 
+        for name, columns in self.columns.items():
+            cells = [(column.name, column.unit, column.meaning) for column in columns]
+            table(name, ("column", "unit", "meaning"), cells, text="meaning")
+        if self.columns:
+            return
         rows = facts_for_people(self)
         doubtful = [number for number, (name, _) in enumerate(rows) if name == "doubts"]
         table(self.path.name, ("", "value"), rows, amber=doubtful)
         table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in self.topics.items()])
 
 
-@verb("flowrec info a.mcap --json", "flowrec info s3://lab/runs/a.mcap")
-def info(session: SessionFile) -> Facts:
+@verb("flowrec info a.mcap --json", "flowrec info a.mcap --tables", "flowrec info s3://lab/runs/a.mcap")
+def info(
+    session: SessionFile,
+    tables: Annotated[
+        bool, typer.Option("--tables", help="Explain the tables that session.table and export make: columns and units.")
+    ] = False,
+) -> Facts:
     """Show how a session ended, its length, content, settings and provenance.
 
     Returns
@@ -104,7 +122,13 @@ def info(session: SessionFile) -> Facts:
     facts["tags"] = list(dict.fromkeys(tag for note in added for tag in note.tags))
     recorded_figures = of_text(outcome)
     told = Facts(facts | {key: value for key, value in recorded_figures.items() if key not in (*facts, *_REPEATED)})
-    told.path, told.topics = path, session.topics
+    told.path, told.topics, told.columns = path, session.topics, {}
+    if tables:
+        from flowrec.store import columns_of
+
+        known = session.reader.topics
+        named = {known.by_path[path].field: path for path in session.topics if path in known.by_path}
+        told.columns = {f"{name} ({path})": columns_of(name, known) for name, path in named.items()}
     return told
 
 

@@ -103,7 +103,7 @@ FAULTS = {
     "missing": (status(404), r"is not there \(404\)"),
     "broken": (status(500), r"the server answers 500, \d tries"),
     "cut": (lambda to, a, b, size: answer(to, a, b, size, b"x" * ((b - a) // 2)) is None, "was cut, \\d tries"),
-    "lying": (lambda to, a, b, size: answer(to, a, b, size, b"x", announced=False) is None, "sent 1 of"),
+    "lying": (lambda to, a, b, size: answer(to, a, b, size, b"x", announced=False) is None, "sent 1 of|no connection"),
     "silent": (lambda *_: time.sleep(1.2) is None, "does not answer in time"),
     "shorter": (lambda to, a, b, size: answer(to, a, b - 1, size, b"x" * (b - a)) is None, "were asked for"),
     "other": (lambda to, a, b, size: answer(to, 7, 7 + b - a, size, b"x" * (b - a + 1)) is None, "were asked for"),

@@ -47,6 +47,15 @@ class FlowField(Message):
     values, which are means over an opening. In a field without `wall_px`, from numerics 1, velocities are means.
     """
 
+    def __repr__(self) -> str:
+        height, width = self.pressure_pa.shape
+        fastest = float(np.hypot(*np.moveaxis(self.velocity_um_s, -1, 0)).max(initial=0.0))
+        stated = f", states an error of {100.0 * self.error_share:.1f} %" if self.error_share is not None else ""
+        return (
+            f"<flow by {self.method}: {width} x {height} pixels of {self.um_per_px:g} um, at most {fastest:.0f} um/s"
+            f"{stated}>"
+        )
+
     stamp_ns: int
     request: int
     method: Annotated[str, "fvm, assimilate, pi_unet, ..."]

@@ -154,7 +154,7 @@ def test_a_message_that_makes_no_sense_is_an_error_in_a_table_too(tmp_path: Path
         )
         with pytest.raises(SessionError, match=why):
             Session(path).table("estimate")
-    with pytest.raises(SessionError, match="there is no topic 'tracks'; the topics are frame"):
+    with pytest.raises(SessionError, match="there is no topic 'tracks'; did you mean 'track'"):
         flowrec.open(GOLDEN).table("tracks")
 
 
