@@ -105,6 +105,34 @@ def text_of_figure(key: str, value: Value) -> str:
     return f"{value:.1f} {_UNITS[suffix]}"
 
 
+def way_text(figures: Mapping[str, Value]) -> str:
+    """The way to the goal, its time as planned and that on the shortest way; '' where nothing was navigated."""
+    if figures.get("navigation_s") is None:
+        return ""
+    text = {key: text_of_figure(key, value) for key, value in figures.items()}
+    way = f"{text['route_length_um']} to the goal in {text['navigation_s']}, planned {text['planned_s']}"
+    if "shortest_way_um" in text:
+        return f"{way}; the shortest way ({text['shortest_way_um']}) would take {text['shortest_way_s']}"
+    return f"{way}; on the shortest way the flow is too fast for the robot" if "shortest_way_s" in text else way
+
+
+def flow_text(figures: Mapping[str, Value]) -> str:
+    """Methods and errors of the maps, as assumed and refined, and the error that the last one states; '' without."""
+    text = {key: text_of_figure(key, value) for key, value in figures.items() if value is not None}
+    maps = [
+        " ".join(filter(None, (name, text.get(f"{name}_flow_error"), f"({text[f'{name}_method']})")))
+        for name in ("assumed", "refined")
+        if f"{name}_method" in text
+    ]
+    if not maps:
+        return ""
+    told = f"flow{' error' if 'assumed_flow_error' in text else ''}: {', '.join(maps)}"
+    if "stated_flow_error" in text:
+        told += f"; the map states an error of {text['stated_flow_error']}"
+        told += f", from {text['observations']} observations" if "observations" in text else ""
+    return told
+
+
 def with_micro(text: str) -> str:
     """Text for a picture or a page: um, as a terminal and a file may have it, spelt as the axes of plots are."""
     return _UM.sub("µm", text)

@@ -19,10 +19,12 @@ from flowrec.core import (
     OutputFolder,
     UsageError,
     doubts_of,
+    flow_text,
     name_of,
     progress,
     say,
     text_of_figure,
+    way_text,
     with_micro,
 )
 from flowrec.exports import (
@@ -176,12 +178,14 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
     judgement, *_ = verdict.lines()
     provenance = session.provenance
     packages = [(key.removeprefix("package."), text) for key, text in provenance.items() if key.startswith("package.")]
+    won = way_text(session.outcome), flow_text(session.outcome)
     return Page(
         name=session.path.name,
         outcome=outcome,
         good=any(outcome == each and each.completes_mission for each in Outcome) or outcome in _NEUTRAL,
         sentence=sentence(outcome),
         note=_sentence(str(facts["note"] or "")),
+        won=[with_micro(text[:1].upper() + text[1:]) for text in map(str, won) if text],
         doubts=_doubts(data, verdict),
         about=_about(facts, session),
         notes=[note for note in (str(facts.get("notes") or ""), *facts["notes_added"]) if note],

@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.core import (
-    FLOW_FIELDS,
     Coverage,
     Figures,
     FlowField,
     Outcome,
     doubts_of,
+    flow_text,
     name_of,
     say,
     text_of_figure,
     warn,
+    way_text,
 )
 from flowrec.physics import Chip
 from flowrec.run import RunReport
@@ -91,24 +92,13 @@ class Recorded:
 
     def lines(self) -> list[str]:
         """The end of the run and what was won, as text: outcome, way, flow, files; what is not known is left out."""
-        text = {key: text_of_figure(key, value) for key, value in self.facts.items() if value is not None}
-        note = f" ({text['note']})" if text.get("note") else ""
-        ended = [f"{text['outcome']}{note} after {text['duration_s']}, computed in {text['wall_s']}"]
-        if "navigation_s" in text:
-            ended.append(
-                f"{text['route_length_um']} to the goal in {text['navigation_s']}, {_against_shortest(self.facts)}"
-            )
-        maps = [
-            " ".join(filter(None, (name, text.get(f"{name}_flow_error"), f"({text[f'{name}_method']})")))
-            for name in FLOW_FIELDS
-            if f"{name}_method" in text
-        ]
-        flow = [f"flow{' error' if 'assumed_flow_error' in text else ''}: {', '.join(maps)}"] if maps else []
-        if flow and "stated_flow_error" in text:
-            flow[0] += f"; the map states an error of {text['stated_flow_error']}"
-            flow[0] += f", from {text['observations']} observations" if "observations" in text else ""
-        also = [f"{name_of(key)}: {text[key]}" for key in _ALSO if self.facts.get(key)]
-        return ["; ".join(ended), *flow, *also, f"file: {files_text(self.path, self.files)}"]
+        facts = self.facts
+        note = f" ({facts['note']})" if facts.get("note") else ""
+        duration, wall = (text_of_figure(key, facts[key]) for key in ("duration_s", "wall_s"))
+        ended = f"{facts['outcome']}{note} after {duration}, computed in {wall}"
+        also = [f"{name_of(key)}: {text_of_figure(key, facts[key])}" for key in _ALSO if facts.get(key)]
+        won = ["; ".join(filter(None, (ended, way_text(facts)))), flow_text(facts)]
+        return [*filter(None, won), *also, f"file: {files_text(self.path, self.files)}"]
 
     def show(self) -> None:
         """Print how the run ended, and what to do next."""
@@ -127,17 +117,6 @@ class Recorded:
             warn(f"doubtful: {doubt}")
         if sessions:
             say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")
-
-
-def _against_shortest(facts: Figures) -> str:
-    """The planned duration, and that of the shortest way."""
-    planned = f"planned {text_of_figure('planned_s', facts.get('planned_s'))}"
-    if "shortest_way_s" not in facts:
-        return planned
-    if facts["shortest_way_s"] is None:
-        return f"{planned}; on the shortest way the flow is too fast for the robot"
-    length, time = (text_of_figure(key, facts[key]) for key in ("shortest_way_um", "shortest_way_s"))
-    return f"{planned}; the shortest way ({length}) would take {time}"
 
 
 def judges_of(pipeline: Pipeline) -> tuple[TrackQuality, MotionOfRun]:

@@ -92,6 +92,7 @@ class Page:
     good: bool
     sentence: str
     note: str
+    won: Sequence[str]  # what the run has won: the way and the flow
     doubts: Sequence[str]  # why it is doubtful
     about: str  # when, where, with what, in one line
     notes: Sequence[str]  # of people
