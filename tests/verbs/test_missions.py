@@ -56,7 +56,8 @@ def test_the_end_of_a_mission_tells_its_outcome_its_way_what_was_won_and_where_t
     assert f"states an error of {stated}, from {facts['observations']} observations" in flow
     assert file.startswith(f"file: {mission.path} (")
     slow = {key: value for key, value in facts.items() if key != "shortest_way_um"} | {"shortest_way_s": None}
-    odd = replace(mission, facts={**slow, "contacts": 2, "frames_dropped": 3}).lines()
+    odd = replace(mission, facts={**slow, "contacts": 2, "frames_dropped": 3, "planned_s": 99.0}).lines()
+    assert "planned 99.0 s" in odd[0]
     assert odd[0].endswith("on the shortest way the flow is too fast for the robot")
     assert odd[2:4] == ["wall contacts: 2", "frames dropped: 3"]
 
