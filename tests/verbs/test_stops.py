@@ -20,6 +20,8 @@ from flowrec.core.coverage import Coverage
 from flowrec.core.terminal import Progress
 from flowrec.run.control import RunControl
 from flowrec.verbs import replay_segments
+from flowrec.verbs.check_run import FileCheck
+from flowrec.verbs.cli import main
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.listed import columns_for_people
 from flowrec.verbs.ls import ls
@@ -182,6 +184,25 @@ def test_a_check_and_an_export_that_are_stopped_say_after_how_much(tmp_path: Pat
     assert done.returncode == 143 and list(tmp_path.iterdir()) == []
     assert "of 12.2 s (SIG" in done.stderr and done.stderr.count("\n") == 1, done.stderr
     assert json.loads(done.stdout)["covered"]["whole"] is False
+
+
+@pytest.mark.parametrize("verb", ["check", "report"])
+def test_a_verb_that_is_stopped_in_a_part_of_it_is_stopped_and_leaves_nothing(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A report begins with a check, whose verdict so far is no report."""
+
+    def stopped(_self: FileCheck) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FileCheck, "read", stopped)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["flowrec", verb, str(MODERATE)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = "".join(capsys.readouterr())
+    assert ended.value.code == 130 and "stopped" in told, told
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_is_covered_is_never_said_of_more() -> None:
