@@ -76,7 +76,7 @@ from .run_figures import (
 )
 from .setting_rows import (
     SettingRow as SettingRow, commented_toml as commented_toml, section_summary as section_summary,
-    setting_rows as setting_rows, toml_value as toml_value,
+    setting_rows as setting_rows,
 )
 from .simulated_settings import (
     Optics as Optics, Simulated as Simulated, SimulatedImage as SimulatedImage,
