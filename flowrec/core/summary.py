@@ -107,8 +107,8 @@ def text_of_figure(key: str, value: Value) -> str:
 
 def way_text(figures: Mapping[str, Value]) -> str:
     """The way to the goal, its time as planned and that on the shortest way; '' where nothing was navigated."""
-    if figures.get("navigation_s") is None:
-        return ""
+    if any(figures.get(key) is None for key in ("route_length_um", "navigation_s", "planned_s")):
+        return ""  # a file may state one without the other
     text = {key: text_of_figure(key, value) for key, value in figures.items()}
     way = f"{text['route_length_um']} to the goal in {text['navigation_s']}, planned {text['planned_s']}"
     if "shortest_way_um" in text:

@@ -14,7 +14,6 @@ import textwrap
 import tokenize
 from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
-from enum import StrEnum
 from typing import Any, Literal, get_args, get_origin
 
 import tomli_w
@@ -129,8 +128,6 @@ def _valid(hint: Any) -> str:
             return "one of " + (", ".join(part.names()) or "those of other packages")
         if get_origin(part) is Literal:
             return "one of " + ", ".join(map(str, get_args(part)))
-        if isinstance(part, type) and issubclass(part, StrEnum):
-            return "of " + ", ".join(part)
     valid = range_of(hint)
     several = "s" if any(get_origin(part) is tuple for part in parts) else ""
     names = {bool: "true or false", str: f"text{several}", int: f"whole number{several}", float: f"number{several}"}

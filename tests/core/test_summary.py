@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from flowrec.core.summary import of_text, with_micro
+from flowrec.core.summary import Value, of_text, way_text, with_micro
 from flowrec.store.reader import SessionReader
 from flowrec.store.session import Session
 from flowrec.verbs.cli import main
@@ -123,6 +123,13 @@ def test_a_new_file_holds_the_count_of_dropped_frames_once_and_readers_take_the_
     assert Session(session).outcome["frames_dropped"] == 0
     for older in ({"frames_dropped": "3"}, {"dropped_frames": "3"}, {"frames_dropped": "1", "dropped_frames": "3"}):
         assert of_text(older) == {"frames_dropped": 3}
+
+
+def test_what_a_file_states_of_the_way_in_part_only_is_no_sentence() -> None:
+    whole: dict[str, Value] = {"route_length_um": 7190.0, "navigation_s": 23.0, "planned_s": 23.1}
+    assert way_text(whole) == "7.19 mm to the goal in 23.0 s, planned 23.1 s"
+    for key in whole:
+        assert way_text({name: value for name, value in whole.items() if name != key}) == ""
 
 
 def test_pictures_and_pages_spell_micrometres_as_axes_do_and_leave_names_alone() -> None:

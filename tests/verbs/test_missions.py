@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import flowrec
 from flowrec.core.system.outputs import MCAP, Output
 from flowrec.run.replay_figures import before_after
 from flowrec.stages.config import load_config
@@ -46,6 +47,17 @@ def test_the_end_of_a_mission_tells_its_outcome_its_way_what_was_won_and_where_t
     facts = mission.facts
     assert facts["shortest_way_um"] <= 1.01 * facts["route_length_um"]
     assert facts["shortest_way_s"] >= 0.99 * facts["planned_s"], "no way is faster than the one in least time"
+    last = mission.report.last
+    assert last.refined is not None and last.assumed is not None and last.route is not None
+    assert facts["stated_flow_error"] == last.refined.error_share != last.assumed.error_share
+    session = flowrec.open(mission.path)
+    begin_um, config = last.route.waypoints_um[0], session.config
+    by_length = replace(config.plan, method="astar_length")
+    on_the_refined, on_the_assumed = (
+        by_length.plan(field, begin_um, config.mission.goal, session.chip, config.robot).arrival_s[-1]
+        for field in (last.refined, last.assumed)
+    )
+    assert facts["shortest_way_s"] == pytest.approx(on_the_refined) != pytest.approx(on_the_assumed)
     ended, flow, file = mission.lines()
     assert ended.startswith("reached after ") and f"planned {facts['planned_s']:.1f} s" in ended
     assert ended.endswith(f"would take {facts['shortest_way_s']:.1f} s")
