@@ -1,5 +1,5 @@
 from .calibrate_chip import (
-    PictureChip as PictureChip, calibrate_chip as calibrate_chip, draw_outline as draw_outline,
+    PictureChip as PictureChip, calibrate_chip as calibrate_chip, draw_outline as draw_outline, open_field as open_field,
 )
 from .calibrate_coils import calibrate_coils as calibrate_coils
 from .calibrate_image import (
@@ -10,7 +10,6 @@ from .calibrate_motion import (
     ANYWHERE as ANYWHERE, calibrate_motion as calibrate_motion, figures_of as figures_of, fit_log as fit_log, fit_samples as fit_samples,
     heading_settings as heading_settings, remarks as remarks, rows_of as rows_of, sampled_s as sampled_s,
 )
-from .images import png_of as png_of
 from .motion_fit import MotionFit as MotionFit, UNEXPLAINED as UNEXPLAINED
 from .picture_registration import ImageVerdict as ImageVerdict, orientation_by_image as orientation_by_image
 from .tuning import tune as tune

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
 import cv2
+import numpy as np
 
 from flowrec.core import ChipError, UsageError, __version__, say, table
 from flowrec.measure.images import Colours, Mask, SourcePicture, png_of, read_picture, with_curves
@@ -129,6 +130,7 @@ def calibrate_chip(
     channel: str = "grey",
     wall_shift_um: float = 0.0,
     overwrite: bool = False,
+    seen: PictureChip | None = None,
 ) -> PictureChip:
     """Find the channel in a picture; write `out` (TOML), the mask of the same stem (PNG) and an overlay.
 
@@ -142,6 +144,7 @@ def calibrate_chip(
     inlet_speed_um_s : mean; None: it is left open.
     channel : red, green, blue or grey of colours.
     wall_shift_um : all walls are moved outwards by so much; a known width shows by how much.
+    seen : of an earlier call with the same picture, so that the channel need not be looked for again.
 
     Raises
     ------
@@ -156,9 +159,9 @@ def calibrate_chip(
         raise UsageError(f"--wall-shift {wall_shift_um:g}: it is in um, so give --um-per-px, too")
     seeds = [_point(text) for text in seed_points]
     outputs = check_outputs(out, (path,), overwrite, (".png", _OVERLAY))
-    picture = read_picture(path, channel)
+    picture = read_picture(path, channel) if seen is None else seen.picture
     try:
-        found = segment(picture.image, cast(Shown, walls), seeds)
+        found = segment(picture.image, cast(Shown, walls), seeds) if seen is None else seen.found
     except ChipError as error:
         raise ChipError(f"{path}: {error}") from error
     if wall_shift_um and um_per_px is not None:
@@ -185,6 +188,13 @@ def calibrate_chip(
         mask_png, _ = chip_files(done.chip(out.stem))
         write_outputs(outputs, (chip_toml(done, out.stem).encode(), mask_png, png_of(draw_outline(done))))
     return done
+
+
+def open_field(width_px: int, height_px: int) -> bytes:
+    """PNG of a mask without a channel: fluid, but for the first and the last row, since a chip must have a wall."""
+    mask = np.full((height_px, width_px), 255, np.uint8)
+    mask[[0, -1]] = 0
+    return png_of(mask)
 
 
 def chip_toml(done: PictureChip, name: str) -> str:

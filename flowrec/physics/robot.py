@@ -26,10 +26,10 @@ class RobotSettings:
     # of the sphere, or of half of the longest side; walls are kept at least so far away
     radius_um: _Radius | None = None
     um_per_rev: Annotated[float, Range(0.01, 1e5)] = 25.0  # k: distance rolled per revolution of the field
-    max_speed_um_s: _Speed | None = None  # v_max, relative to the fluid
-    step_out_hz: _Frequency | None = None  # above it the robot no longer follows the field
+    max_speed_um_s: _Speed | None = None  # largest speed relative to the fluid, v_max
+    step_out_hz: _Frequency | None = None  # frequency of the field above which the robot no longer follows it
     step_out_margin: PositiveShare = 0.9  # fraction of the step-out frequency that is commanded at most
-    delay_s: _Delay | None = None  # from command to motion
+    delay_s: _Delay | None = None  # time from command to motion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

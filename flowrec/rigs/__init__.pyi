@@ -1,6 +1,6 @@
 from .lab.amplifiers.limits import CommandLimits as CommandLimits
 from .lab.cameras.camera import CameraInfo as CameraInfo, Grabbed as Grabbed, Wanted as Wanted, bits_of as bits_of
-from .lab.cameras.probe import probe_camera as probe_camera
+from .lab.cameras.probe import first_camera as first_camera, probe_camera as probe_camera
 from .lab.drive import probe_amplifier as probe_amplifier
 from .lab.guardian import Guardian as Guardian, ONLY_HARDWARE as ONLY_HARDWARE
 from .movie.exported import session_of_log as session_of_log, with_exported as with_exported

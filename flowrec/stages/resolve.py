@@ -105,11 +105,16 @@ def _narrow(kind: type[_Section], settings: Any, **changed: Any) -> _Section:
     return kind(**{each.name: getattr(settings, each.name) for each in fields(settings)} | changed)
 
 
-def _refuse_unmeasured(config: Config) -> None:
-    """Only a simulated robot and camera can be made to fit the chip."""
+def not_measured(config: Config) -> list[str]:
+    """Keys of the settings that are not given, and that somebody has to measure on a real rig."""
     given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
     needless = (*_MAY_BE_NONE, *(_ONLY_FOR_DRIVING if config.mission.observes else ()))
-    missing = [key for key, value in given.items() if value is None and key not in needless]
+    return [key for key, value in given.items() if value is None and key not in needless]
+
+
+def _refuse_unmeasured(config: Config) -> None:
+    """Only a simulated robot and camera can be made to fit the chip."""
+    missing = not_measured(config)
     if config.rig != SIMULATED and missing:
         raise UsageError(
             f"rig = {config.rig!r}: {', '.join(missing)} not given; measure them and set each: only the robot and the "

@@ -251,7 +251,7 @@ def _with_chosen_body(asked: Config, p: Pipeline, image: Frame, sight: Sight, ro
         x, y = places[number - 1].round(2).tolist()
         return replace(asked, tracker=replace(asked.tracker, click_px=(x, y), click_frame=image.index))
     count = f"at least {len(places)}" if len(places) >= MOST - 4 else len(places)  # near the limit some are left out
-    picture = _write_picture(_draw_numbers(image.image, places, p), folder / f"{Path(name).stem}_robots{PICTURE[0]}")
+    picture = write_picture(_draw_numbers(image.image, places, p), folder / f"{Path(name).stem}_robots{PICTURE[0]}")
     raise UsageError(
         f"{name}: {what.format(count, image.index)}; {picture} shows them with numbers: say which one is the "
         "robot with --robot N, or by its place: --robot X,Ypx in the first image, --robot X,Y in um on the chip"
@@ -296,7 +296,7 @@ def _draw_numbers(image: Image, places_px: Floats, p: Pipeline) -> NDArray[np.ui
     return np.asarray(shown, np.uint8)
 
 
-def _write_picture(picture: NDArray[np.uint8], path: Path) -> Path:
+def write_picture(picture: Image, path: Path) -> Path:
     """Write a picture under a name that no other file has; where it is there already, its path."""
     done, data = cv2.imencode(PICTURE[0], picture)
     assert done, "OpenCV writes PNG"

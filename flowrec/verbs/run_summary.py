@@ -116,7 +116,8 @@ class Recorded:
         for doubt in self.doubts:
             warn(f"doubtful: {doubt}")
         if sessions:
-            say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")
+            first = f"export {sessions[0]} tables" if "not_refined" in self.facts else f"replay {sessions[0]} --refine"
+            say(f"next: flowrec {first}    flowrec view {sessions[0]}")
 
 
 def judges_of(pipeline: Pipeline) -> tuple[TrackQuality, MotionOfRun]:

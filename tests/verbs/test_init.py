@@ -6,27 +6,41 @@ import io
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
+from flowrec.core.errors import RigError, UsageError
 from flowrec.core.system.outputs import OutputError
+from flowrec.movies.opening import open_movie
+from flowrec.physics.chip.io import load_chip
 from flowrec.stages.config import load_config
 from flowrec.stages.control.coil_log import columns_by_unit
+from flowrec.stages.resolve import resolve
+from flowrec.verbs.doctor import doctor
+from flowrec.verbs.init import LAB as LAB_WORD
 from flowrec.verbs.init import init
+from tests.extras import why
+from tests.twins.coils import device
+from tests.twins.emulator import emulated, showing
 
 LAB = Path(__file__).parents[2] / "sessions" / "movie"
 MOVIE, LOG = LAB / "robot.mp4", LAB / "coils.csv"
 KNOWN: dict[str, Any] = {"um_per_px": 13.0, "radius_um": 50.0, "inlet": ["left:0"], "inlet_speed_um_s": 180.0}
 
 
-def test_what_a_movie_does_not_tell_is_listed_at_once_beside_a_picture_that_names_the_openings(tmp_path: Path) -> None:
+def test_what_a_movie_does_not_tell_is_listed_at_once_beside_a_picture_that_names_the_openings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "flowrec.toml"
-    with pytest.raises(UsageError, match=r"missing: --radius .*; --inlet \(.*left:0, right:0, bottom:0\); --inlet-sp"):
+    with pytest.raises(UsageError, match=r"missing, and nobody to ask: --radius, --inlet, --inlet-speed$"):
         init(MOVIE, um_per_px=13.0, out=out)
+    assert (
+        "--inlet   openings that are inlets, with commas between: left:0, right:0, bottom:0" in capsys.readouterr().err
+    )
     assert [each.name for each in tmp_path.iterdir()] == ["robot_openings.png"]
-    with pytest.raises(UsageError, match="missing: --inlet-speed"):
+    with pytest.raises(UsageError, match=r"nobody to ask: --inlet-speed$"):
         init(MOVIE, **{**KNOWN, "inlet_speed_um_s": None}, out=out)
 
 
@@ -51,7 +65,7 @@ def test_a_movie_is_imported_by_what_init_has_written(tmp_path: Path) -> None:
         init(MOVIE, **KNOWN, out=done.path)
 
 
-@pytest.mark.slow("looks for a channel twice")
+@pytest.mark.slow("looks for a channel")
 def test_a_person_at_a_terminal_is_asked_again_after_an_answer_that_can_not_be_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -66,6 +80,86 @@ def test_a_person_at_a_terminal_is_asked_again_after_an_answer_that_can_not_be_r
     chip = flowrec.stages.config.load_config(done.path).chip
     assert Path(chip.path) == tmp_path / "robot_chip.toml"
     assert 'kind = "inlet"\nspeed_um_s = 180.0' in (tmp_path / "robot_chip.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow("imports a movie")
+def test_a_movie_without_a_channel_is_tracked(tmp_path: Path) -> None:
+    """A dark bead that goes along a line of 2 px an image."""
+    folder = tmp_path / "dish"
+    folder.mkdir()
+    centres = [(40.0 + 2.0 * number, 60.0) for number in range(12)]
+    y, x = np.mgrid[:120, :160]
+    for number, (cx, cy) in enumerate(centres):
+        bead = 160.0 * np.clip(7.0 - np.hypot(x - cx, y - cy), 0.0, 1.0)
+        cv2.imwrite(str(folder / f"{number:03d}.png"), np.asarray(200.0 - bead, np.uint8))
+    with pytest.raises(UsageError, match=r"nobody to ask: --um-per-px, --radius$"):
+        init(folder, no_chip=True, out=tmp_path / "flowrec.toml")
+    done = init(folder, no_chip=True, um_per_px=2.0, radius_um=14.0, out=tmp_path / "flowrec.toml")
+    assert done.lines()[1] == f"next: flowrec import {folder} {done.path} --fps F -o dish.mcap"
+    imported = flowrec.import_movie(folder, tmp_path / "a.mcap", done.path, fps=10.0)
+    track = flowrec.open(imported.path).table("track").to_pandas()
+    places_um = track[["position_x_um", "position_y_um"]].to_numpy()
+    assert track["seen"][: len(centres)].all()
+    assert np.allclose(places_um[: len(centres)], 2.0 * np.array(centres), atol=0.4)
+    with pytest.raises(UsageError, match=r"--no-chip: chip\.path names a chip"):
+        init(folder, no_chip=True, sets={"chip.path": "mine.png"}, out=tmp_path / "b.toml")
+
+
+def test_the_configuration_of_a_lab_holds_what_its_camera_says_and_a_chip_of_its_image(tmp_path: Path) -> None:
+    sets = {"lab.camera": "opencv", "lab.device": str(MOVIE), "mission.phases": "observe"}
+    done = init(LAB_WORD, **KNOWN, sets=sets, out=tmp_path / "lab.toml")
+    config = load_config(done.path)
+    assert (config.rig, config.lab.camera, config.camera.width_px, config.camera.height_px) == (
+        "lab",
+        "opencv",
+        384,
+        308,
+    )
+    assert resolve(config, load_chip(config.chip)).mission.observes
+    assert sorted(each.name for each in tmp_path.iterdir()) == [
+        "lab.png",
+        "lab.toml",
+        "lab_chip.png",
+        "lab_chip.toml",
+        "lab_chip_overlay.png",
+    ]
+
+
+def test_a_lab_that_drives_is_asked_for_every_limit_of_robot_and_coils(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A current that the coils do not bear must be nobody's default."""
+    sets = {"lab.camera": "opencv", "lab.device": str(MOVIE), "chip.path": "drawn.png"}
+    with pytest.raises(UsageError) as refused:
+        init(LAB_WORD, um_per_px=13.0, radius_um=50.0, sets=sets, out=tmp_path / "lab.toml")
+    wanted = ("robot.max_speed_um_s", "robot.step_out_hz", "robot.delay_s", "lab.serial.port", "coils.max_current_a")
+    assert str(refused.value).endswith(": " + ", ".join(f"--set {key}=..." for key in wanted))
+    assert "largest current of a coil, number from 0.001 to 1000 A" in capsys.readouterr().err
+    assert not (tmp_path / "lab.toml").exists()
+
+
+@pytest.mark.slow("compiles the firmware's twin, and opens a camera")
+def test_init_finds_camera_and_amplifier_of_a_lab_and_leaves_its_coils_without_a_current(tmp_path: Path) -> None:
+    """By pylon's emulator and the serial firmware."""
+    pytest.importorskip("pypylon", reason=why("pypylon"))
+    (tmp_path / "seen").mkdir()
+    with open_movie(MOVIE) as movie:
+        features = showing(tmp_path / "seen", [np.asarray(movie.median_image(), np.uint8)])
+    sets = {"lab.camera": "pylon", "lab.device_config": str(features), "coils.max_current_a": 1.5}
+    sets |= {"robot.max_speed_um_s": 600.0, "robot.step_out_hz": 28.0, "robot.delay_s": 0.05}
+    out = tmp_path / "lab.toml"
+    with emulated(), device("serial", tmp_path) as coils:
+        with pytest.raises(RigError, match="no such port"):
+            init(LAB_WORD, **KNOWN, sets=sets | {"lab.serial.port": "/dev/none"}, out=out)
+        assert not out.exists()
+        init(LAB_WORD, **KNOWN, sets=sets | {"lab.serial.port": coils.address}, out=out)
+        assert not coils.energised()
+        looked = doctor(out)
+        assert any("amplifier" in line for line in looked.lines())
+        assert "camera" not in {finding.what for finding in looked.findings if finding.level == "failure"}
+    config = load_config(out)
+    assert (config.camera.width_px, config.camera.height_px) == (4096, 4096), "the whole sensor"
+    assert config.lab.device == "0815-0000" and config.coils.max_current_a == 1.5
 
 
 def test_columns_of_a_log_are_found_by_the_units_in_their_names_unless_two_have_the_same() -> None:

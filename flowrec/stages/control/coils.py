@@ -39,7 +39,7 @@ class Coils:
     mt_per_a: Annotated[Matrix3, Range(-1e4, 1e4)] = ((2.1, 0.0, 0.0), (0.0, 1.9, 0.0), (0.0, 0.0, 1.5))
     # field without currents: of the earth and the microscope
     bias_mt: Annotated[PerCoil, Range(-1e3, 1e3)] = (0.0, 0.0, 0.0)
-    max_current_a: Annotated[float, Range(1e-3, 1e3)] = 5.0  # of each coil
+    max_current_a: Annotated[float, Range(1e-3, 1e3)] = 5.0  # largest current of a coil
     ramp_s: Annotated[float, Range(0.0, 60.0)] = 0.2  # from zero to the full amplitude and back
     amplifier: AmplifierSettings = field(default_factory=AmplifierSettings)
 

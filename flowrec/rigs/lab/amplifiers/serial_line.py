@@ -62,6 +62,11 @@ class SerialAmplifier:
         """The amplifier of a configuration."""
         return cls(config.lab.serial.port, config.lab.serial.baud, config.coils)
 
+    @staticmethod
+    def ports() -> list[str]:
+        """The serial ports of this computer; none is opened, because what is behind it may be another device."""
+        return sorted(port.device for port in list_ports.comports())
+
     def __init__(self, port: str, baud: int, coils: Coils) -> None:
         self._name, self._baud, self._coils = port, baud, coils
         self._port: serial.Serial | None = None
@@ -171,7 +176,7 @@ class SerialAmplifier:
     # ---- opening
 
     def _open_port(self) -> serial.Serial:
-        there = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
+        there = ", ".join(self.ports()) or "none"
         if not self._name:
             raise UsageError(f"lab.serial.port: which serial port is the amplifier's? There are: {there}")
         try:

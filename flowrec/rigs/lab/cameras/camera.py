@@ -30,7 +30,7 @@ class Wanted:
     Attributes
     ----------
     device : serial number, model, address or name; for opencv a number, a file or a URL. '': the only one there is.
-    width_px, height_px : the region of interest.
+    width_px, height_px : the region of interest; 0: the whole image.
     offset_px : (x, y) of its upper left pixel; None: the region lies in the middle of the sensor.
     rate_hz : of the frames; with a hardware trigger, of the triggers.
     exposure_s : 0: as the camera has it.
@@ -209,15 +209,21 @@ def difference(key: str, asked: float | None, got: float | None, unit: str) -> t
     return (f"{key} = {asked:g}{unit} asked, {got:.4g}{unit} reached",)
 
 
+class NoCameraError(RigError):
+    """A driver finds no camera at all; another one may."""
+
+
 def find_device(devices: dict[str, Any], wanted: str, where: str) -> Any:
     """The device that is wanted among those that were found, by name, or by a unique part of its description.
 
     Raises
     ------
-    RigError : none, or several.
+    NoCameraError : none.
+    RigError : none that is wanted, or several.
     """
     if not devices:
-        raise RigError(f"{where}: no camera found; see to its power and cable, and whether another program uses it")
+        text = "no camera found; see to its power and cable, and whether another program uses it"
+        raise NoCameraError(f"{where}: {text}")
     names = [name for name in devices if not wanted or wanted.lower() in name.lower()]
     listed = "; ".join(devices)
     if not names:

@@ -113,10 +113,11 @@ def _region(device: Features, wanted: Wanted) -> tuple[int, int]:
     """Set the region of interest. The offset is taken away first, because it limits the size."""
     axes = (("Width", "OffsetX", "width_px", wanted.width_px), ("Height", "OffsetY", "height_px", wanted.height_px))
     sizes = []
-    for axis, (size, offset, key, asked) in enumerate(axes):
+    for axis, (size, offset, key, size_px) in enumerate(axes):
         if device.feature(offset).writable:
             device.put(offset, 0)
         have = device.feature(size)
+        asked = size_px or round(have.high)
         if have.value != asked:
             if not have.writable:
                 raise RigError(

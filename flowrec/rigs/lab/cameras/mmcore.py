@@ -14,7 +14,7 @@ from pathlib import Path
 from pymmcore_plus import CMMCorePlus
 
 from flowrec.core import RigError, nanoseconds
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, bits_of, difference
+from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, NoCameraError, Wanted, bits_of, difference
 
 _RATES = ("FrameRate", "Frame Rate", "AcquisitionFrameRate", "FramesPerSecond")  # names of one property
 _LABEL = "Camera"
@@ -85,7 +85,7 @@ class MmcoreCamera:
             core.initializeDevice(_LABEL)
             core.setCameraDevice(_LABEL)
         else:
-            raise RigError(
+            raise (RigError if config else NoCameraError)(
                 f"lab.device_config = {config!r}: no such file; name a configuration file of Micro-Manager, or "
                 f"adapter:device; adapters here: {', '.join(core.getDeviceAdapterNames()) or 'none (mmcore install)'}"
             )
@@ -115,7 +115,7 @@ class MmcoreCamera:
             )
         core.clearROI()
         full = core.getImageWidth(), core.getImageHeight()
-        size = wanted.width_px, wanted.height_px
+        size = (wanted.width_px, wanted.height_px) if wanted.width_px else full
         at = wanted.offset_px or (max(full[0] - size[0], 0) // 2, max(full[1] - size[1], 0) // 2)
         if size != full:
             if size[0] + at[0] > full[0] or size[1] + at[1] > full[1]:

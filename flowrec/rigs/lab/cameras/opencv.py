@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from flowrec.core import RigError
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Image, Wanted, bits_of, difference
+from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Image, NoCameraError, Wanted, bits_of, difference
 
 _TIMEOUT_MS = 1000
 _COLOUR_NOTE = "the camera sends colours: their luminance is used"
@@ -53,12 +53,13 @@ class OpencvCamera:
         else:
             self._capture = capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
         if not capture.isOpened():
-            raise RigError(f"opencv: no camera answers at {source}; see its cable, and whether another program uses it")
+            absent = RigError if wanted.device else NoCameraError
+            raise absent(f"opencv: no camera answers at {source}; see its cable, and whether another program uses it")
         notes = self._set(capture) if number is not None else ()
         self._first = first = self._read(capture)
         image = self._grey(first)
         height, width = image.shape
-        if (width, height) != (wanted.width_px, wanted.height_px):
+        if wanted.width_px and (width, height) != (wanted.width_px, wanted.height_px):
             raise RigError(
                 f"camera.width_px x camera.height_px = {wanted.width_px} x {wanted.height_px}: images of {source} have "
                 f"{width} x {height}; set that"
@@ -86,8 +87,9 @@ class OpencvCamera:
         if self._bits > 8:
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"Y16 "))
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, wanted.width_px)
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted.height_px)
+        if wanted.width_px:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, wanted.width_px)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted.height_px)
         capture.set(cv2.CAP_PROP_FPS, wanted.rate_hz)
         if wanted.gain is not None:
             capture.set(cv2.CAP_PROP_GAIN, wanted.gain)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import partial
 
-from flowrec.core import NS_PER_S, CameraLosses, Image, RigError, envelope, seconds
-from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
+from flowrec.core import NS_PER_S, CameraLosses, Image, RigError, UsageError, envelope, seconds
+from flowrec.rigs.lab.cameras.camera import CameraInfo, NoCameraError, wanted_of
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from flowrec.stages import CAMERAS, CameraSettings, Lab
 
@@ -41,8 +42,26 @@ class CameraProbe:
     image: Image | None = None
 
 
-def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> CameraProbe:
+def first_camera(camera: CameraSettings, lab: Lab, drivers: Iterable[str]) -> tuple[str, CameraProbe]:
+    """The first of some drivers that finds a camera, and that camera with its whole image and its own exposure.
+
+    Raises
+    ------
+    RigError : none finds one, or the first that does can not use it.
+    """
+    found_none: list[str] = []
+    for driver in drivers:
+        try:
+            return driver, probe_camera(camera, replace(lab, camera=driver), as_it_is=True)
+        except (NoCameraError, UsageError) as error:
+            found_none.append(str(error))
+    raise RigError("no camera found; " + "; ".join(found_none))
+
+
+def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5, *, as_it_is: bool = False) -> CameraProbe:
     """Open the camera of a configuration, take its frames for some seconds, and close it.
+
+    `as_it_is` takes its whole image, and its own exposure.
 
     Raises
     ------
@@ -50,6 +69,8 @@ def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> C
     UsageError : a package is not installed; the line names the command.
     """
     wanted = wanted_of(camera, lab)
+    if as_it_is:
+        wanted = replace(wanted, width_px=0, height_px=0, exposure_s=0.0)
     driver = CAMERAS[lab.camera].load()
     frames: list[Captured] = []
     with Grabber(partial(driver.of, wanted), wanted, lab.queue_frames) as grabber:
