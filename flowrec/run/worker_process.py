@@ -17,6 +17,8 @@ import traceback
 from collections import deque
 from dataclasses import replace
 
+import numpy as np
+
 from flowrec.core import WORKER_FIELDS, ChildProcess, FlowrecError, Parent, Tick
 from flowrec.run.workers import Result, Results, order_of, work
 from flowrec.stages import Pipeline, warm_up
@@ -128,23 +130,28 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _answer(pipeline: Pipeline, order: Tick) -> bytes:
-    """The result of an order, or what it raised, as bytes that the parent can read."""
+def _answer(pipeline: Pipeline, order: Tick) -> tuple[bytes, bool]:
+    """The result of an order, or what it raised, as bytes that the parent can read; and whether it is a result."""
     try:
-        return pickle.dumps(work(pipeline, order), pickle.HIGHEST_PROTOCOL)
+        return pickle.dumps(work(pipeline, order), pickle.HIGHEST_PROTOCOL), True
     except BaseException as error:  # noqa: BLE001  the parent raises it
         error.add_note(traceback.format_exc())
         with contextlib.suppress(Exception):
             sent = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
             pickle.loads(sent)  # noqa: S301 - an exception may be written without complaint and not be readable
             if isinstance(error, Exception):
-                return sent
-        return pickle.dumps(FlowrecError(f"{_NAME} failed ({_describe(error)})"), pickle.HIGHEST_PROTOCOL)
+                return sent, False
+        return pickle.dumps(FlowrecError(f"{_NAME} failed ({_describe(error)})"), pickle.HIGHEST_PROTOCOL), False
 
 
 if __name__ == "__main__":
     parent = Parent()
     given: Pipeline = parent.order()
     warm_up()
+    to_prepare = given.refiner.preparations(given.chip, given.solver)
     while True:
-        parent.answer(_answer(given, parent.order()))
+        sent, done = _answer(given, parent.order())
+        parent.answer(sent)
+        while done and parent.is_idle and (part := next(to_prepare, None)) is not None:
+            with contextlib.suppress(FlowrecError, np.linalg.LinAlgError):  # the order that needs it says so
+                part()

@@ -8,7 +8,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from flowrec.core.errors import FlowrecError
-from flowrec.core.messages import Mission
+from flowrec.core.messages import FlowField, Mission
 from flowrec.core.topics import Tick
 from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import work
@@ -32,6 +32,7 @@ HURDLES = """
     import sys, threading, time
     from dataclasses import dataclass
     from flowrec.core.errors import FlowError
+    from flowrec.physics.flow.solver import FlowSolver
 
     def explode():
         raise RuntimeError("this can not be read back")
@@ -52,6 +53,12 @@ HURDLES = """
         error_share: float | None = None
         def __reduce__(self):
             return explode, ()
+
+    @dataclass(frozen=True)
+    class Watched(FlowSolver):
+        def sensitivities(self, *given):
+            print("grid", self.k, file=sys.stderr, flush=True)
+            return super().sensitivities(*given)
 
     class Stage:
         def __init__(self, *ways):
@@ -115,6 +122,18 @@ def answer(process: ProcessWorker) -> Any:
     except Exception as error:  # noqa: BLE001
         return error
     return results.get("assumed")
+
+
+@pytest.mark.slow("starts a worker")
+def test_what_later_orders_need_of_the_chip_is_computed_while_no_order_waits(pipeline, order, working) -> None:
+    import hurdles  # found by `working`
+
+    with closing(ProcessWorker(replace(pipeline, solver=hurdles.Watched()))) as process:
+        process.submit(order)
+        assert isinstance(answer(process), FlowField)
+        until(lambda: b"grid 1\n" in process._child.printed)  # of other depths and walls
+        process.submit(order)
+        assert isinstance(answer(process), FlowField)
 
 
 @pytest.mark.slow("starts three workers")

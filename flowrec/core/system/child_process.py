@@ -114,6 +114,11 @@ class Parent:
         """Wait for the next order."""
         return self._orders.get()
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether no order waits."""
+        return self._orders.empty()
+
     def answer(self, pickled: bytes) -> None:
         """Send an answer."""
         try:

@@ -10,7 +10,7 @@ observations contradict the walls. The field is the mean over these hypotheses, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,13 +19,14 @@ from typing import Annotated
 import numpy as np
 
 from flowrec.core import Bools, Floats, FlowError, FlowField, Range
-from flowrec.physics import Chip, FlowSolver, fluid_image, law_text, median_width_um
+from flowrec.physics import Chip, FlowSolver, fluid_image, law_text, median_width_um, with_wall_offset
 from flowrec.stages.refine.causes import AS_STATED, Observed
 from flowrec.stages.refine.discretisation_error import ModelError
 from flowrec.stages.refine.disturbances import held_back
+from flowrec.stages.refine.doubts import deposits_um_s
 from flowrec.stages.refine.field_variance import expected_error, field_variance, prior_variance
 from flowrec.stages.refine.findings import explained_by_pump, findings, wanders, with_departure, with_obstacle
-from flowrec.stages.refine.flow_model import flow_model
+from flowrec.stages.refine.flow_model import FlowModel, flow_model
 from flowrec.stages.refine.held_back import scores_of
 from flowrec.stages.refine.hypothesis import (
     HypothesisFit,
@@ -46,7 +47,7 @@ from flowrec.stages.refine.obstacles import PLACES, Obstacle, likely_obstacles, 
 from flowrec.stages.refine.predictive_check import find_departure
 from flowrec.stages.refine.prior import PriorSettings
 from flowrec.stages.refine.report import over_error, report
-from flowrec.stages.refine.wall_bias import in_biased_walls
+from flowrec.stages.refine.wall_bias import OFFSETS_PX, coarser, in_biased_walls, wall_mode
 
 LARGEST_PX = 30_000  # fluid pixels of a chip for which depths and walls are tried: each is a geometry of its own
 DEPTHS_WIDTHS = (0.4, 0.8, 1.6, 3.2)  # grid of depths of a chip that states none, in median channel widths
@@ -69,6 +70,10 @@ LEAST_WEIGHT = 0.02  # of a hypothesis that is computed to the end
 # In ln evidence: what is farther behind at first sight is not begun. Registration, lines and inertia have then added up
 # to 3.6 more to a depth than to the chip as it is stated (surveys of procedural vessels).
 BEHIND = 5.0
+
+
+def _is_small(chip: Chip) -> bool:
+    return bool(np.count_nonzero(chip.mask) <= LARGEST_PX)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +150,7 @@ class Assimilate(PriorSettings):
         operator = self.with_shaking(problem.operator.distinct(), problem.chip, problem.solver)
         problem = replace(problem, operator=operator)
         every = self.hypotheses(problem.operator, problem.chip, problem.solver)
-        if obstacles and problem.chip.law is None and np.count_nonzero(problem.chip.mask) <= LARGEST_PX:
+        if obstacles and problem.chip.law is None and _is_small(problem.chip):
             every = self._with_obstacles(every, problem)
         flow_um_s, std_um_s = of_the_field(every.best)
         return self._field(every, problem), replace(problem.operator, flow_um_s=flow_um_s, std_um_s=std_um_s)
@@ -183,17 +188,15 @@ class Assimilate(PriorSettings):
             If the chip's own flow can not be computed, or is at rest.
         """
         steps = Steps(self.max_steps, self.tolerance)
-        small = np.count_nonzero(chip.mask) <= LARGEST_PX
         chips, prior = [chip], [1.0]
-        if self.doubt_depth and chip.depth_um is None and small:
-            width = median_width_um(chip)
-            chips += [replace(chip, depth_um=share * width) for share in DEPTHS_WIDTHS]
-            prior = [UNSTATED_SHARE, *[(1.0 - UNSTATED_SHARE) / len(DEPTHS_WIDTHS)] * len(DEPTHS_WIDTHS)]
+        if depths := self._depths(chip):
+            chips += depths
+            prior = [UNSTATED_SHARE, *[(1.0 - UNSTATED_SHARE) / len(depths)] * len(depths)]
         own = self._observe(chip, chip, operator, solver)
         robust = robust_noise(own)
         if len(chips) > 1:
             # The coarse grid proposes: most depths are out of the question, and a factorisation is dear.
-            chips, prior = self._plausible(chips, prior, operator, replace(solver, k=1), robust)
+            chips, prior = self._plausible(chips, prior, operator, coarser(solver), robust)
         # Of the chip as it is stated, walls, robot and registration are so too, or their errors are as usual.
         cases = [(chip, AS_STATED, prior[0] * AS_STATED_SHARE)]
         prior[0] *= 1.0 - AS_STATED_SHARE
@@ -203,7 +206,7 @@ class Assimilate(PriorSettings):
             with suppress(FlowError):  # a depth whose flow can not be computed
                 observed = own if other is chip else self._observe(other, chip, operator, solver)
                 begun.append((robust, begin(replace(observed, usual=usual), robust, steps), float(np.log(share))))
-        if self.doubt_walls and small:
+        if self.doubt_walls and _is_small(chip):
             noise, state, ln_share = begun[1]  # walls that are off by chance only
             observe = partial(self._observe, stated=chip, operator=operator)
             biased = in_biased_walls(chip, solver, state, noise, observe, steps)
@@ -229,6 +232,30 @@ class Assimilate(PriorSettings):
         # weight - prior x evidence of the stated chip: of what is not likelier than that, nothing is left.
         shares = weights * -np.expm1(np.minimum(-ln_ratio, 0.0))
         return Hypotheses(found, weights / weights.sum(), shares / shares.sum(), chip.mask)
+
+    def preparations(self, chip: Chip, solver: FlowSolver) -> Iterator[Callable[[], object]]:
+        """The parts of a fit that depend on the chip alone, each of which leaves its result in the cache.
+
+        A part raises FlowError where the flow in it can not be computed.
+        """
+        yield partial(flow_model, self, self.model, chip, solver)
+        for other in self._depths(chip):
+            yield partial(self._model, other, chip, coarser(solver))
+        if _is_small(chip):
+            yield lambda: deposits_um_s(flow_model(self, self.model, chip, solver), solver)
+        if self.doubt_walls and _is_small(chip):
+            yield partial(wall_mode, chip, solver)
+            yield from (partial(self._in_moved_walls, offset_px, chip, solver) for offset_px in OFFSETS_PX)
+
+    def _in_moved_walls(self, offset_px: float, chip: Chip, solver: FlowSolver) -> FlowModel:
+        return self._model(with_wall_offset(chip, offset_px), chip, coarser(solver))
+
+    def _depths(self, chip: Chip) -> list[Chip]:
+        """The chip with each depth that is tried, where it states none."""
+        if not (self.doubt_depth and chip.depth_um is None and _is_small(chip)):
+            return []
+        width_um = median_width_um(chip)
+        return [replace(chip, depth_um=share * width_um) for share in DEPTHS_WIDTHS]
 
     def _plausible(
         self, chips: list[Chip], prior: list[float], operator: ObservationOperator, solver: FlowSolver, robust: Robust
@@ -302,9 +329,13 @@ class Assimilate(PriorSettings):
         return complete(robust, begin(observed, robust, steps), steps)
 
     def _observe(self, chip: Chip, stated: Chip, operator: ObservationOperator, solver: FlowSolver) -> Observed:
-        """The observations in the model of a chip. A depth that is not stated is known to the spacing of the grid."""
+        """The observations in the model of a chip."""
+        return Observed.of(self._model(chip, stated, solver), operator)
+
+    def _model(self, chip: Chip, stated: Chip, solver: FlowSolver) -> FlowModel:
+        """The model of a chip. A depth that is not stated is known to the spacing of the grid."""
         settings = replace(self, depth_std_share=DEPTH_STD_SHARE) if chip.depth_um != stated.depth_um else self
-        return Observed.of(flow_model(settings, self.model, chip, solver), operator)
+        return flow_model(settings, self.model, chip, solver)
 
     def _field(self, every: Hypotheses, problem: RefinementProblem) -> FlowField:
         """The mean over the hypotheses as a field on the chip's own mask."""

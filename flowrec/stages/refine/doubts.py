@@ -36,7 +36,7 @@ def doubted_places(observed: Observed, robust: Robust, solver: FlowSolver, block
     none = Doubts.none(len(model.base))
     if model.chip.law is not None or len(model.base) > LARGEST_PX or not observed.operator.count:
         return none
-    changes = _changes(model, solver)
+    changes = deposits_um_s(model, solver)
     if not len(changes):
         return none
     likelihood = Likelihood.of(observed, robust)
@@ -51,7 +51,7 @@ def doubted_places(observed: Observed, robust: Robust, solver: FlowSolver, block
     return Doubts(changes[kept] * best[kept, None, None], probability[kept])
 
 
-def _changes(model: FlowModel, solver: FlowSolver) -> Changes:
+def deposits_um_s(model: FlowModel, solver: FlowSolver) -> Changes:
     """(k, n, 2) um/s what a deposit on either wall of each piece of the channels does, from the cache if possible."""
     chip, expansion = model.chip, model.expansion
 

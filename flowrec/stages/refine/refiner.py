@@ -6,6 +6,7 @@ one field of `Refiner` more, named in the row's options.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
@@ -182,6 +183,15 @@ class Refiner:
     def prior_error_share(self, chip: Chip, solver: FlowSolver) -> float | None:
         """Expected relative RMSE of the chip's assumed flow; None where nothing says how wrong it may be."""
         return self.assimilate.prior_error_share(chip, solver)
+
+    def preparations(self, chip: Chip, solver: FlowSolver) -> Iterator[Callable[[], object]]:
+        """Parts of the refinements and survey orders to come, to be called while nobody waits; they fill caches only.
+
+        A part raises FlowrecError where it can not be done. The order that needs it then says so.
+        """
+        yield self._selected_method
+        for part in self.assimilate.preparations(chip, solver):
+            yield one_blas_thread()(part)
 
     @one_blas_thread()
     def uncertainty(

@@ -54,6 +54,11 @@ def wall_mode(chip: Chip, solver: FlowSolver) -> Floats:
     return mode
 
 
+def coarser(solver: FlowSolver) -> FlowSolver:
+    """The solver whose grid is that of the pixels, by which chips are compared at first."""
+    return replace(solver, k=1)
+
+
 def nearest_offset(found_px: float) -> float:
     """The offset nearest to one that was found, of those at which flows are computed."""
     return float(np.clip(STEP_PX * np.round(found_px / STEP_PX), -MOST_PX, MOST_PX))
@@ -98,7 +103,7 @@ def in_biased_walls(
     doubted = doubtful(usual.evidence, usual.sizes)
     if not doubted and gain_by_bias(usual, robust, wall_mode(chip, solver)) < WORTH_TRYING:
         return None
-    coarse, seen = replace(solver, k=1), {}
+    coarse, seen = coarser(solver), {}
     for offset_px in OFFSETS_PX:
         with suppress(FlowError):  # channels that are closed
             observed = observe(with_wall_offset(chip, offset_px), solver=coarse)

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 
 from flowrec.core.errors import FlowError, FlowrecError, UsageError
 from flowrec.core.messages import Observations
+from flowrec.physics.flow.linear_solver import clear_cache
 from flowrec.stages.config import load_config
 from flowrec.stages.refine import REFINERS, Refiner
 
@@ -96,6 +98,30 @@ def test_every_method_bears_an_observation_beside_a_wall_at_the_edge_of_the_flui
     observed = Observations(0, points, np.tile([5.0, 1.0], (3, 1)), np.full(3, 2.0))
     field = any_refiner.refine(case.solver.solve(chip), observed, chip, case.solver)
     assert np.isfinite(field.velocity_um_s).all()
+
+
+def test_what_depends_on_the_chip_alone_can_be_prepared_and_changes_no_result(twin, monkeypatch):
+    """Prepared, a survey order compares depths and mask offsets without a flow of its own, and says the same."""
+    factorised = []
+    splu = scipy.sparse.linalg.splu
+    monkeypatch.setattr(
+        scipy.sparse.linalg, "splu", lambda *given, **named: factorised.append(1) or splu(*given, **named)
+    )
+    world, refiner = twin(truth=(130.0, 0.0, 0.0)), Refiner()
+
+    def order():
+        found = refiner.uncertainty(world.assumed, world.observations, world.chip, world.solver)
+        return found.mean_um_s.tobytes(), found.covariance.tobytes()
+
+    clear_cache()
+    usual, in_order = order(), len(factorised)
+    clear_cache()
+    for part in refiner.preparations(world.chip, world.solver):
+        part()
+    before = len(factorised)
+    assert order() == usual
+    left = len(factorised) - before
+    assert in_order > 20 and left <= 2, "only the walls that the observations ask for have a flow yet to compute"
 
 
 def test_an_unknown_method_is_an_error_that_names_the_nearest(twin):
