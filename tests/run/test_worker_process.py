@@ -56,9 +56,9 @@ HURDLES = """
 
     @dataclass(frozen=True)
     class Watched(FlowSolver):
-        def sensitivities(self, *given):
-            print("grid", self.k, file=sys.stderr, flush=True)
-            return super().sensitivities(*given)
+        def sensitivities(self, chip, *given):
+            print("depth", chip.depth_um, file=sys.stderr, flush=True)
+            return super().sensitivities(chip, *given)
 
     class Stage:
         def __init__(self, *ways):
@@ -131,7 +131,7 @@ def test_what_later_orders_need_of_the_chip_is_computed_while_no_order_waits(pip
     with closing(ProcessWorker(replace(pipeline, solver=hurdles.Watched()))) as process:
         process.submit(order)
         assert isinstance(answer(process), FlowField)
-        until(lambda: b"grid 1\n" in process._child.printed)  # of other depths and walls
+        until(lambda: process._child.printed.count(b"depth") > process._child.printed.count(b"depth None"))
         process.submit(order)
         assert isinstance(answer(process), FlowField)
 
