@@ -16,7 +16,7 @@ from flowrec.core import Floats
 from flowrec.physics import Chip, FlowSolver, Sensitivities, chip_key, compute_cached, median_width_um
 from flowrec.stages.refine.channel_cells import cell_widening, channel_cells, resistance_modes
 from flowrec.stages.refine.discretisation_error import ModelError
-from flowrec.stages.refine.prior import Prior, PriorSettings, law_widths
+from flowrec.stages.refine.prior import Prior, PriorSettings, at_rest, law_widths
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +45,8 @@ def flow_model(settings: PriorSettings, error: ModelError, chip: Chip, solver: F
     """
 
     def compute() -> FlowModel:
+        if not chip.boundary_values.any():  # before a factorisation of what may be a whole image
+            raise at_rest(chip)
         law = bool(law_widths(settings, chip))
         expansion = solver.sensitivities(chip, settings.depth_std_share > 0.0, settings.inlet_shape_std > 0.0, law)
         pressure = expansion.pressure(np.zeros(len(expansion.modes)), expansion.start())

@@ -27,6 +27,14 @@ class PriorSettings:
     law_std: Annotated[float, Range(0.0, 3.0)] = 0.15
 
 
+def at_rest(chip: Chip) -> FlowError:
+    """The error for a chip whose assumed flow is at rest."""
+    return FlowError(
+        f"chip '{chip.name}' is assumed to stand still, so nothing says how wrong that may be: give an inlet speed or "
+        "an outlet pressure of the right size"
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """z ~ N(0, 1), the unknowns in prior standard deviations, and their effect on the P parameters of Sensitivities.
@@ -57,10 +65,7 @@ class Prior:
         speed = np.where(values != 0.0, np.abs(values), np.abs(values[inlet]).max(initial=0.0))
         std = np.where(inlet, settings.inlet_std_share * speed, settings.outlet_std_share * drop_pa)
         if min(std) <= 0.0:
-            raise FlowError(
-                f"chip '{chip.name}' is assumed to stand still, so nothing says how wrong that may be: "
-                "give an inlet speed or an outlet pressure of the right size"
-            )
+            raise at_rest(chip)
         with_depth = settings.depth_std_share > 0.0 and chip.depth_um is not None
         shapes = 2 * int(inlet.sum()) if settings.inlet_shape_std > 0.0 else 0
         law_stds = law_widths(settings, chip)
