@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from flowrec.core.messages import FlowField
 
 Value = str | int | float | bool | None
 Figures = dict[str, Value]
@@ -18,6 +22,7 @@ _UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns
 _WHOLE = ("_bytes", "_ns")
 _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
+_ASSIMILATED = "assimilated "  # before the number of observations, at the begin of the note of a refined map
 _UM = re.compile(r"(?<![\w.])um\b")
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
 DOUBTS = "doubts"  # key of the outcome of a session: why its result is doubtful; absent: it is not
@@ -105,6 +110,15 @@ def text_of_figure(key: str, value: Value) -> str:
     return f"{value:.1f} {_UNITS[suffix]}"
 
 
+def end_text(figures: Mapping[str, Value]) -> str:
+    """Outcome of a run with its note and its duration, those that are known; '' without an outcome."""
+    if not figures.get("outcome"):
+        return ""
+    note = f" ({figures['note']})" if figures.get("note") else ""
+    duration = figures.get("duration_s")
+    return f"{figures['outcome']}{note}" + ("" if duration is None else f" after {text_of_figure('_s', duration)}")
+
+
 def way_text(figures: Mapping[str, Value]) -> str:
     """The way to the goal, its time as planned and that on the shortest way; '' where nothing was navigated."""
     if any(figures.get(key) is None for key in ("route_length_um", "navigation_s", "planned_s")):
@@ -133,9 +147,32 @@ def flow_text(figures: Mapping[str, Value]) -> str:
     return told
 
 
+def learned_text(refined: FlowField | None) -> str:
+    """Findings of the last refinement, or the reason of its refusal; '' without a refinement."""
+    if refined is None:
+        return ""
+    if refined.refused:
+        return f"the refined flow was refused, the map in use stays: {refined.refused}"
+    first, _, rest = refined.note.partition("; ")
+    if first.startswith(_ASSIMILATED):
+        return f"learned from {first.removeprefix(_ASSIMILATED)}: {rest}" if rest else ""
+    return f"learned: {refined.note}" if first else ""
+
+
+def verdict_lines(figures: Mapping[str, Value], refined: FlowField | None = None) -> list[str]:
+    """Sentences of every picture and page about a run: its end, the reason, its doubts, the way, the flow, findings.
+
+    What is not known is left out. The first one begins with the outcome; units are spelt as in pictures.
+    """
+    doubts = [f"doubtful: {doubt}" for doubt in doubts_of(figures)]
+    ended, note = end_text({**figures, "note": ""}), str(figures.get("note") or "")
+    told = [ended, note, *doubts, way_text(figures), flow_text(figures), learned_text(refined)]
+    return [with_micro(text[:1].upper() + text[1:]) for text in told if text]
+
+
 def with_micro(text: str) -> str:
-    """Text for a picture or a page: um, as a terminal and a file may have it, spelt as the axes of plots are."""
-    return _UM.sub("µm", text)
+    """Text for a picture or a page: um and +-, as a terminal and a file may have them, as µm and ±."""
+    return _UM.sub("µm", text).replace("+-", "±")
 
 
 def is_numeric(key: str) -> bool:

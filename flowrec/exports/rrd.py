@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.core import DOUBTS, RRD, SessionError
+from flowrec.core import DOUBTS, RRD, SessionError, end_text, verdict_lines
 from flowrec.exports.formats import TimeProgress
 from flowrec.physics import Chip
 from flowrec.stages import ResolvedConfig, calibration_of
@@ -87,14 +87,19 @@ def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:
     rows = before_after(pair)
     told = [row for row in rows if row[0] not in _OF_COMMANDS]
     shown = [(key, was, now) for key, was, now in told if key != "planner" or was != now]
-    return summary_document(["recorded", "replayed"], shown, [registration_remark(pair.replayed.refined)])
+    ended = end_text({key: recorded.outcome.get(key) for key in ("outcome", "duration_s")}) or "its end is not known"
+    verdict = [f"Replay of {recorded.path.name}: {ended}", *verdict_lines({}, pair.replayed.refined)]
+    remarks = [doubts_remark(replayed.outcome), registration_remark(pair.replayed.refined)]
+    return summary_document(["recorded", "replayed"], shown, remarks, verdict)
 
 
 def _pair(first: Session, second: Session) -> rr.TextDocument:
     was, now = ({key: value for key, value, _ in rows_of_run(each.last, each.outcome)} for each in (first, second))
     named = list(zip(PAIR, (first, second), strict=True))
     notes = [remark(each.outcome, f"{name}: ") for remark in (doubts_remark, note_of) for name, each in named]
-    rows = [(key, was.get(key), now.get(key)) for key in ("goal", *FIGURES) if key in was or key in now]
+    rows = [
+        (key, was.get(key), now.get(key)) for key in (*FIGURES[:1], "goal", *FIGURES[1:]) if key in was or key in now
+    ]
     return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, notes)
 
 

@@ -12,7 +12,7 @@ import rerun as rr
 
 from flowrec.console.page_state import SHOWN, PageState
 from flowrec.core.enums import Outcome
-from flowrec.core.messages import FlowField, Shift
+from flowrec.core.messages import Applied, FlowField, Shift
 from flowrec.core.topics import Tick
 from flowrec.physics.chip.registration import Calibration
 from flowrec.physics.flow.sampling import sample
@@ -299,3 +299,16 @@ def test_the_summary_says_by_how_much_the_picture_is_moved_in_the_middle_of_the_
     grown = 0.97 * np.eye(2)
     registration = np.column_stack((grown, middle + np.array([12.5, -4.0]) - grown @ middle))
     assert "(12.5, -4.0) um" in registration_remark(replace(refined, registration=registration))
+
+
+def test_where_nothing_is_commanded_the_field_is_that_of_the_log_of_the_coils(scene: Scene, ticks: list[Tick]) -> None:
+    mission, currents = ticks[-1].mission, ticks[-1].currents
+    assert mission is not None and currents is not None
+    applied = Applied(ticks[-1].stamp_ns, 12.5, 0.0, 3.0, np.zeros(3), np.zeros(2))
+    shown = []
+    for phase in ("navigate", "observe"):
+        record = Record()
+        logger = TickLogger(record, scene)  # type: ignore[arg-type]
+        logger.log(replace(ticks[-1], mission=replace(mission, phase=phase), applied=applied))
+        shown += record.logged["/coils/frequency"].scalars.as_arrow_array().to_pylist()
+    assert shown == [currents.frequency_hz, 12.5]
