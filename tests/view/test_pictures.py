@@ -16,6 +16,7 @@ from flowrec.core.messages import Applied, FlowField, Shift
 from flowrec.core.topics import Tick
 from flowrec.physics.chip.registration import Calibration
 from flowrec.physics.flow.sampling import sample
+from flowrec.stages.run_figures import figures_of
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.view import colours, flow_values, maps
 from flowrec.view.colours import ColourScale
@@ -312,3 +313,12 @@ def test_where_nothing_is_commanded_the_field_is_that_of_the_log_of_the_coils(sc
         logger.log(replace(ticks[-1], mission=replace(mission, phase=phase), applied=applied))
         shown += record.logged["/coils/frequency"].scalars.as_arrow_array().to_pylist()
     assert shown == [currents.frequency_hz, 12.5]
+
+
+def test_a_run_that_ends_in_its_survey_states_no_route_to_the_goal(scene: Scene, ticks: list[Tick]) -> None:
+    tick = ticks[-1]
+    assert tick.mission is not None and tick.route is not None
+    ended = replace(tick, mission=replace(tick.mission, phase="done", outcome="lost"))
+    assert "planned_s" in figures_of(scene.chip, ended, None, 0, None)
+    surveyed = replace(ended, route=replace(tick.route, method="survey"))
+    assert not {"planner", "planned_s", "route_length_um"} & set(figures_of(scene.chip, surveyed, None, 0, None))

@@ -113,7 +113,7 @@ def _background(ax: Axes, data: ReportData) -> None:
     scene, picture = data.scene, data.picture
     if picture is not None:
         height, width = (size * picture.step for size in picture.image.shape)
-        # Brightened: the path and the arrows are dark.
+        # Brightened: the path is dark.
         ax.imshow(picture.image, cmap="gray", vmin=-90, vmax=255, extent=(0.0, width, height, 0.0), zorder=0)
     else:
         _on_mask(ax, data, np.where(scene.chip.mask, 255.0, 200.0), cmap="gray", vmin=0, vmax=255, zorder=0)
@@ -137,7 +137,7 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
     scale = data.speed_scale()
     opacity = _OVER_PICTURE if data.picture is not None else 1.0
     values = speed(field, scene.chip.mask)
-    how = {"cmap": style.COLOUR_MAPS["speed"], "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
+    how = {"cmap": style.colour_map(scale), "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
     speeds = _on_mask(ax, data, values, **how)
     bar = figure.colorbar(speeds, ax=ax, shrink=0.85, aspect=22, pad=0.01, ticks=scale.ticks)
     bar.set_label("speed of the flow (µm/s)")
@@ -150,12 +150,13 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
             angles="xy",
             scale_units="xy",
             scale=1.0,
-            color=style.INK,
-            width=0.0018,
+            color="white",
+            edgecolor=style.INK,
+            lw=0.25,
+            width=0.0022,
             headwidth=4.5,
             headlength=5.0,
             headaxislength=4.0,
-            alpha=0.75,
             zorder=3,
         )
 
