@@ -61,7 +61,7 @@ from .summary import (
     comparison_for_people as comparison_for_people, doubts_of as doubts_of, doubts_text as doubts_text,
     finite as finite, is_count as is_count, is_numeric as is_numeric, name_of as name_of, of_text as of_text,
     rows_for_people as rows_for_people, text_of_figure as text_of_figure,
-    end_text as end_text, flow_text as flow_text, verdict_lines as verdict_lines,
+    end_text as end_text, flow_text as flow_text, goal_text as goal_text, verdict_lines as verdict_lines,
     way_text as way_text, with_micro as with_micro,
 )
 from .system.blas_threads import one_blas_thread as one_blas_thread

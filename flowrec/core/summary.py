@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from flowrec.core.declarations import Floats
     from flowrec.core.messages import FlowField
 
 Value = str | int | float | bool | None
@@ -134,9 +135,9 @@ def flow_text(figures: Mapping[str, Value]) -> str:
     """Methods and errors of the maps, as assumed and refined, and the error that the last one states; '' without."""
     text = {key: text_of_figure(key, value) for key, value in figures.items() if value is not None}
     maps = [
-        " ".join(filter(None, (name, text.get(f"{name}_flow_error"), f"({text[f'{name}_method']})")))
+        " ".join(filter(None, (name, text.get(f"{name}_flow_error"), _in_brackets(text.get(f"{name}_method")))))
         for name in ("assumed", "refined")
-        if f"{name}_method" in text
+        if f"{name}_method" in text or f"{name}_flow_error" in text  # an older file states one without the other
     ]
     if not maps:
         return ""
@@ -145,6 +146,16 @@ def flow_text(figures: Mapping[str, Value]) -> str:
         told += f"; the map states an error of {text['stated_flow_error']}"
         told += f", from {text['observations']} observations" if "observations" in text else ""
     return told
+
+
+def _in_brackets(text: str | None) -> str:
+    return f"({text})" if text else ""
+
+
+def goal_text(goal_um: Floats | None) -> str:
+    """The goal (2,) of a mission, um on the chip; 'none' without one, or where it is not finite."""
+    known = goal_um is not None and all(map(math.isfinite, goal_um))
+    return f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um" if known and goal_um is not None else "none"
 
 
 def learned_text(refined: FlowField | None) -> str:

@@ -19,6 +19,7 @@ from flowrec.core import (
     OutputFolder,
     UsageError,
     doubts_of,
+    goal_text,
     name_of,
     progress,
     say,
@@ -223,8 +224,7 @@ def _sentence(text: str) -> str:
 
 def _about(facts: dict[str, Any], data: ReportData) -> str:
     """Time, place, equipment and goal of the run, in one line."""
-    goal_um = goal_of(data.history.last.mission)
-    goal = "no goal" if goal_um is None else f"goal ({goal_um[0]:.0f}, {goal_um[1]:.0f}) µm"
+    goal = with_micro(f"goal {goal_text(goal_of(data.history.last.mission))}")
     rig = {"simulated": "in simulation", "movie": "from a movie", "lab": "in the laboratory"}
     when = f"{str(facts['recorded'])[:16].replace('T', ' ')} UTC"
     made = f"replay of {facts['replay_of']}, made {when}" if facts["replay_of"] else f"recorded {when}"

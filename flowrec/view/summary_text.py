@@ -18,6 +18,7 @@ from flowrec.core import (
     comparison_for_people,
     doubts_text,
     flow_text,
+    goal_text,
     printable,
     seconds,
     verdict_lines,
@@ -78,8 +79,7 @@ def _document(paragraphs: Iterable[str]) -> rr.TextDocument:
 
 def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
     """Outcome, goal and figures of one run; those that are not known are left out."""
-    goal_um = goal_of(last.mission)
-    goal: Row = ("goal", "none" if goal_um is None else f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um", None)
+    goal: Row = ("goal", goal_text(goal_of(last.mission)), None)
     known = [key for key in FIGURES if figures.get(key) not in (None, "") and (key, figures[key]) != _USUAL]
     rows: list[Row] = [(key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO]
     return [*rows[:1], goal, *rows[1:]] if "outcome" in known else [goal, *rows]
@@ -90,7 +90,7 @@ def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.
     said = {*_IN_END, *(_IN_WAY if way_text(figures) else ()), *(_IN_FLOW if flow_text(figures) else ())}
     rows = comparison_for_people(row for row in rows_of_run(last, figures) if row[0] not in said)
     about = "; ".join([f"session {title}", *(f"{name} {value}" for name, value, _ in rows)])
-    ended, *told = verdict_lines({"outcome": "no end"} | figures, last.refined)
+    ended, *told = verdict_lines({"outcome": "its end is not known", **figures}, last.refined)
     return _document(_sentences(filter(None, [ended, about, *told, registration_remark(last.refined)])))
 
 
