@@ -177,6 +177,7 @@ def verdict_lines(figures: Mapping[str, Value], refined: FlowField | None = None
     """
     doubts = [f"doubtful: {doubt}" for doubt in doubts_of(figures)]
     ended, note = end_text({**figures, "note": ""}), str(figures.get("note") or "")
+    ended += ", doubtful" if ended and doubts else ""
     told = [ended, note, *doubts, way_text(figures), flow_text(figures), learned_text(refined)]
     return [with_micro(text[:1].upper() + text[1:]) for text in told if text]
 

@@ -19,6 +19,7 @@ from flowrec.core import (
     OutputFolder,
     UsageError,
     doubts_of,
+    doubts_text,
     goal_text,
     name_of,
     progress,
@@ -179,7 +180,8 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
     judgement, *_ = verdict.lines()
     provenance = session.provenance
     packages = [(key.removeprefix("package."), text) for key, text in provenance.items() if key.startswith("package.")]
-    ended, *_ = verdict_lines({"outcome": outcome, "duration_s": session.duration_s})
+    doubts = _doubts(data, verdict)
+    ended, *_ = verdict_lines({"outcome": outcome, "duration_s": session.duration_s, DOUBTS: doubts_text(doubts)})
     known = {key: value for key, value in session.outcome.items() if key not in ("outcome", "note", DOUBTS)}
     return Page(
         name=session.path.name,
@@ -189,7 +191,7 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
         sentence=sentence(outcome),
         note=_sentence(with_micro(str(facts["note"] or ""))),
         won=verdict_lines(known, data.refined),
-        doubts=_doubts(data, verdict),
+        doubts=doubts,
         about=_about(facts, data),
         notes=[note for note in (str(facts.get("notes") or ""), *facts["notes_added"]) if note],
         key_figures=_key_figures(data),

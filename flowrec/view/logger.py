@@ -106,7 +106,7 @@ class TickLogger:
         self.states.end_marks(tick.stamp_ns)
         if tick.frame is not None and tick.frame is not self._last.frame:
             self._log_image(tick.frame)
-        self._flow.log_not_yet(tick.refined, self._last)
+        self._flow.log_not_yet(tick, self._last)
         self._flow.log_fields(tick, self._last)
         for message in tick.news(self._last, _SHOWN).values():
             self._log_message(message)

@@ -140,7 +140,7 @@ def test_pictures_tell_the_end_first_then_the_reason_the_doubts_what_was_won_and
     assert refined is not None
     found = replace(refined, note="assimilated 53 observations; it moves 10 +- 2 % less")
     assert verdict_lines(figures | flow, found) == [
-        "Lost after 16.2 s",
+        "Lost after 16.2 s, doubtful",
         "At 5 µm",
         "Doubtful: axes",
         "Doubtful: scale",

@@ -129,7 +129,7 @@ def test_the_last_image_and_the_notes_of_the_file_state_how_the_run_ended(sessio
     stopped.outcome = {"outcome": "time over", "duration_s": 0.6, "doubts": "axes"}
     _, metadata, _ = read(written(mp4.Mp4Export(), stopped, tmp_path / "x.mp4"))
     assert told == [("", "axes")] * 3 + [("time over", "axes")]
-    assert "Time over after 0.6 s; Doubtful: axes" in metadata["comment"]
+    assert "Time over after 0.6 s, doubtful; Doubtful: axes" in metadata["comment"]
     mission = session.last.mission
     assert mission.finished and mission.outcome == "reached"
     assert state_text(mission, None, doubtful=True) == "reached, doubtful"

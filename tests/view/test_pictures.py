@@ -322,3 +322,16 @@ def test_a_run_that_ends_in_its_survey_states_no_route_to_the_goal(scene: Scene,
     assert "planned_s" in figures_of(scene.chip, ended, None, 0, None)
     surveyed = replace(ended, route=replace(tick.route, method="survey"))
     assert not {"planner", "planned_s", "route_length_um"} & set(figures_of(scene.chip, surveyed, None, 0, None))
+
+
+def test_a_map_that_comes_later_says_so_until_it_is_there(scene: Scene, ticks: list[Tick]) -> None:
+    field = ticks[-1].assumed
+    assert field is not None
+    record = Record()
+    logger = TickLogger(record, scene)  # type: ignore[arg-type]
+    logger.log(Tick(0))
+    assumed, refined = (f"/flow/{name}/not\\ yet" for name in ("assumed", "refined"))
+    assert record.logged[assumed].labels.as_arrow_array().to_pylist() == ["not computed yet"]
+    logger.log(Tick(1, assumed=field))
+    assert isinstance(record.logged[assumed], rr.Clear)
+    assert not isinstance(record.logged[refined], rr.Clear)
