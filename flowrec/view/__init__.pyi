@@ -13,7 +13,7 @@ from .foxglove_layout import foxglove_layout as foxglove_layout
 from .live import LiveView as LiveView
 from .overlay import Overlay as Overlay
 from .rrd_file import APPLICATION as APPLICATION, is_made_from as is_made_from, write_rrd as write_rrd
-from .scene import Box as Box, Scene as Scene, goal_of as goal_of, way_of as way_of
+from .scene import Box as Box, Scene as Scene, goal_of as goal_of, place_on_chip as place_on_chip, way_of as way_of
 from .screenshot import screenshot as screenshot
 from .status_bar import length_text as length_text, state_text as state_text
 from .summary_text import (

@@ -28,6 +28,7 @@ from flowrec.exports.report import style
 from flowrec.exports.report.curve_figures import RecordingFigure
 from flowrec.exports.report.curves import BUCKETS, CurveBuilder
 from flowrec.exports.report.explanations import MEANINGS, OUTCOMES
+from flowrec.exports.report.path_figure import PathFigure
 from flowrec.exports.report.report_data import ReportData
 from flowrec.exports.report.timeline_figure import TimelineFigure
 from flowrec.store.session_file import WriterOptions
@@ -135,6 +136,24 @@ def test_a_map_has_the_colours_on_the_page_that_it_has_in_the_viewer(table: Tabl
     values = np.linspace(scale.low, scale.high, 256)
     shown = style.colour_map(scale)((values - scale.low) / (scale.high - scale.low))[:, :3]
     assert np.array_equal(np.rint(255.0 * shown), scale.paint(values))
+
+
+def test_image_and_path_lie_where_the_registration_that_was_found_puts_them() -> None:
+    data = ReportData.of(flowrec.open(MODERATE))
+    last, corner, found = data.history.last, np.array([[0.0, 0.0], [1.0, 2.0]]), []
+    assert last.refined is not None
+    for shift_um in (0.0, 100.0):
+        registration = np.array([[1.0, 0.0, shift_um], [0.0, 1.0, 0.0]])
+        data.history.last = replace(last, refined=replace(last.refined, registration=registration))
+        with style.drawing():
+            ax = PathFigure().draw(data, style.WIDE_MM).axes[0]
+        (path,) = (line for line in ax.lines if line.get_color() == style.VERMILLION)
+        image, _flow = ax.images
+        found.append((path.get_xydata(), (image.get_transform() - ax.transData).transform(corner)))
+    moved = data.scene.directions(np.array([data.scene.length_px(100.0), 0.0]))
+    for still, shifted in zip(*found, strict=True):
+        difference = (shifted - still)[np.isfinite(still[:, 0])]
+        assert len(difference) > 1 and difference == pytest.approx(np.tile(moved, (len(difference), 1)), abs=1e-6)
 
 
 def test_an_older_session_without_clocks_says_so_in_words() -> None:

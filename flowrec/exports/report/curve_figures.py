@@ -11,7 +11,7 @@ from flowrec.exports.report import style
 from flowrec.exports.report.curves import Curve
 from flowrec.exports.report.report_data import ReportData
 from flowrec.exports.report.time_axis import line, observation_points, panels, shown_observations
-from flowrec.physics import sample
+from flowrec.physics import on_chip, sample
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -208,7 +208,8 @@ class PathFlowFigure:
             ax.plot(time_s, speed, color=style.QUIET, ls=(0, (4, 2)), label="assumed")
         top = 0.0
         if data.refined is not None:
-            speed, std = _speed(data.refined, path_um), _std(data.refined, path_um)
+            place_um = on_chip(data.refined.registration, path_um)
+            speed, std = _speed(data.refined, place_um), _std(data.refined, place_um)
             ax.fill_between(time_s, np.maximum(speed - std, 0.0), speed + std, color=style.ORANGE, alpha=0.3, lw=0.0)
             ax.plot(time_s, speed, color=style.ORANGE, lw=1.3, label="refined")
             top = float(np.nanmax(speed, initial=0.0))
