@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from flowrec.core.enums import Outcome
+
 if TYPE_CHECKING:
     from flowrec.core.declarations import Floats
     from flowrec.core.messages import FlowField
@@ -112,11 +114,14 @@ def text_of_figure(key: str, value: Value) -> str:
 
 
 def end_text(figures: Mapping[str, Value]) -> str:
-    """Outcome of a run with its note and its duration, those that are known; '' without an outcome."""
+    """Outcome of a run with its note and its duration, those that are known; '' without an outcome.
+
+    A replay ends with its recording, so its duration is none of its own.
+    """
     if not figures.get("outcome"):
         return ""
     note = f" ({figures['note']})" if figures.get("note") else ""
-    duration = figures.get("duration_s")
+    duration = None if figures["outcome"] == Outcome.REPLAYED else figures.get("duration_s")
     return f"{figures['outcome']}{note}" + ("" if duration is None else f" after {text_of_figure('_s', duration)}")
 
 
@@ -125,6 +130,8 @@ def way_text(figures: Mapping[str, Value]) -> str:
     if any(figures.get(key) is None for key in ("route_length_um", "navigation_s", "planned_s")):
         return ""  # a file may state one without the other
     text = {key: text_of_figure(key, value) for key, value in figures.items()}
+    if figures.get("outcome") == Outcome.REPLAYED:  # its robot is that of the recording
+        return f"route of {text['route_length_um']} to the goal, planned {text['planned_s']}; it was not flown"
     way = f"{text['route_length_um']} to the goal in {text['navigation_s']}, planned {text['planned_s']}"
     if "shortest_way_um" in text:
         return f"{way}; the shortest way ({text['shortest_way_um']}) would take {text['shortest_way_s']}"

@@ -181,8 +181,9 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
     provenance = session.provenance
     packages = [(key.removeprefix("package."), text) for key, text in provenance.items() if key.startswith("package.")]
     doubts = _doubts(data, verdict)
-    ended, *_ = verdict_lines({"outcome": outcome, "duration_s": session.duration_s, DOUBTS: doubts_text(doubts)})
-    known = {key: value for key, value in session.outcome.items() if key not in ("outcome", "note", DOUBTS)}
+    known = {"outcome": outcome, "duration_s": session.duration_s, DOUBTS: doubts_text(doubts)}
+    ended, *_ = verdict_lines(known)
+    _, *won = verdict_lines({**session.outcome, **known, "note": "", DOUBTS: ""}, data.refined)
     return Page(
         name=session.path.name,
         outcome=outcome,
@@ -190,7 +191,7 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
         good=any(outcome == each and each.completes_mission for each in Outcome) or outcome in _NEUTRAL,
         sentence=sentence(outcome),
         note=_sentence(with_micro(str(facts["note"] or ""))),
-        won=verdict_lines(known, data.refined),
+        won=won,
         doubts=doubts,
         about=_about(facts, data),
         notes=[note for note in (str(facts.get("notes") or ""), *facts["notes_added"]) if note],

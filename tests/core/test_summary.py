@@ -129,6 +129,9 @@ def test_a_new_file_holds_the_count_of_dropped_frames_once_and_readers_take_the_
 def test_what_a_file_states_of_the_way_in_part_only_is_no_sentence() -> None:
     whole: dict[str, Value] = {"route_length_um": 7190.0, "navigation_s": 23.0, "planned_s": 23.1}
     assert way_text(whole) == "7.19 mm to the goal in 23.0 s, planned 23.1 s"
+    replayed = verdict_lines(whole | {"outcome": "replayed", "note": "replay of a.mcap", "duration_s": 35.1})
+    way = "Route of 7.19 mm to the goal, planned 23.1 s; it was not flown"
+    assert replayed == ["Replayed", "Replay of a.mcap", way]
     for key in whole:
         assert way_text({name: value for name, value in whole.items() if name != key}) == ""
 
