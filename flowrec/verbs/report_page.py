@@ -12,6 +12,7 @@ from typing import Any
 
 from flowrec.core import (
     DOUBTS,
+    Figures,
     FlowField,
     Level,
     Outcome,
@@ -181,7 +182,7 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
     provenance = session.provenance
     packages = [(key.removeprefix("package."), text) for key, text in provenance.items() if key.startswith("package.")]
     doubts = _doubts(data, verdict)
-    known = {"outcome": outcome, "duration_s": session.duration_s, DOUBTS: doubts_text(doubts)}
+    known: Figures = {"outcome": outcome, "duration_s": session.duration_s, DOUBTS: doubts_text(doubts)}
     ended, *_ = verdict_lines(known)
     _, *won = verdict_lines({**session.outcome, **known, "note": "", DOUBTS: ""}, data.refined)
     return Page(
