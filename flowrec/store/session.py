@@ -285,8 +285,8 @@ class Session:
         frames, outcome, last = self.frames, self.outcome, self.last
         image = frames[len(frames) // 2].image if len(frames) else self.chip.mask.astype("uint8")
         recorded = {name: self.provenance.get(name, "") for name in ("wall_time", "operator", "sample", "notes")}
-        rows = [("goal", goal_text(last.mission.goal_um if last.mission is not None else None))]
-        rows += [("chip", self.chip.name)]
+        goal = goal_text(last.mission.goal_um if last.mission is not None else None)
+        rows = [("goal", goal), ("chip", self.chip.name)]
         rows += rows_for_people({key: outcome[key] for key in _CARD_FIGURES if key in outcome})
         rows += [(name.replace("_", " "), value) for name, value in recorded.items() if value]
         rows += [("topics", f"{len(self.topics)}, {sum(self.topics.values())} messages, {len(frames)} images")]
@@ -363,16 +363,14 @@ def card(
     ----------
     rows : names and values, from a file, so not to be trusted.
     image : (h, w) grey levels, which are stretched to the full range; None: no picture.
-    verdict : sentences above the rows, the first one in bold; not to be trusted either.
+    verdict : sentences above the rows, likewise; the first one is bold.
     """
     cells = "".join(
         f'<tr><td style="text-align:left">{_escape(name)}</td><td style="text-align:left">{_escape(value)}</td></tr>'
         for name, value in rows
     )
-    picture = ""
-    if image is not None and image.size:
-        data = base64.b64encode(_thumbnail(image)).decode()
-        picture = f'<img alt="camera image" width="{_CARD_PX}" src="data:image/png;base64,{data}"/>'
+    data = base64.b64encode(_thumbnail(image)).decode() if image is not None and image.size else ""
+    picture = f'<img alt="camera image" width="{_CARD_PX}" src="data:image/png;base64,{data}"/>' if data else ""
     sentences = "".join(
         f"<div>{_escape(text, _CARD_SENTENCE) if number else f'<b>{_escape(text)}</b>'}</div>"
         for number, text in enumerate(verdict)
