@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.core import DOUBTS, RRD, SessionError, end_text, verdict_lines
+from flowrec.core import DOUBTS, RRD, Outcome, SessionError, Tick, end_text, verdict_lines
 from flowrec.exports.formats import TimeProgress
 from flowrec.physics import Chip
 from flowrec.stages import ResolvedConfig, calibration_of
@@ -76,8 +77,23 @@ class RrdExport:
         else:
             summary = document_of_run(session.path.stem, session.last, session.outcome)
         first = next(iter(shown.values()))
-        ticks = {prefix: each.ticks(with_frames=each is first) for prefix, each in shown.items()}
+        ticks = {prefix: _ended(each, each.ticks(with_frames=each is first)) for prefix, each in shown.items()}
         write_rrd(part, scene, ticks, progress, summary)
+
+
+def _ended(session: Session, ticks: Iterable[Tick]) -> Iterator[Tick]:
+    """The ticks; of a run that was stopped the last mission states the outcome, as the file does."""
+    outcome, last = str(session.outcome.get("outcome") or ""), None
+    for tick in ticks:
+        if last is not None:
+            yield last
+        last = tick
+    if last is None:
+        return
+    mission = last.mission
+    if mission is not None and not mission.finished and outcome not in ("", Outcome.REPLAYED):
+        mission = replace(mission, finished=True, outcome=outcome, stamp_ns=last.stamp_ns, since_ns=last.stamp_ns)
+    yield replace(last, mission=mission)
 
 
 def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:

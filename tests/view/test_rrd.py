@@ -6,6 +6,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +20,8 @@ from flowrec.core.errors import SessionError
 from flowrec.core.messages import Health, OperatorEvent
 from flowrec.core.system.outputs import RRD, Output
 from flowrec.core.topics import Tick
+from flowrec.exports import rrd
+from flowrec.store.session import Session
 from flowrec.view.logger import TickLogger
 from flowrec.view.rrd_file import open_stream, write_rrd
 from flowrec.view.scene import Scene
@@ -256,6 +260,18 @@ def test_marks_alarms_and_losses_have_lanes_with_words_and_the_error_ends_with_t
     assert states("/Recording") == ["3 lost, every 2. kept"]
     stamps = [at for at in file.columns["/robot/tracking\\ error"]["session time"] if isinstance(at, int)]
     assert max(stamps) < ticks[60].stamp_ns <= max(file.columns["/camera/robot"]["session time"][1:])  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize(("outcome", "stated"), [("time over", "time over"), ("replayed", "")])
+def test_the_last_tick_of_a_run_that_was_stopped_states_the_outcome_of_its_file(
+    ticks: list[Tick], outcome: str, stated: str
+) -> None:
+    session = cast(Session, SimpleNamespace(outcome={"outcome": outcome}))
+    *before, last = rrd._ended(session, ticks)
+    assert len(before) == len(ticks) - 1 and all(a is b for a, b in zip(before, ticks, strict=False))
+    assert last.mission is not None and last.estimate is ticks[-1].estimate
+    assert (last.mission.outcome, last.mission.finished) == (stated, bool(stated))
+    assert not stated or last.mission.since_ns == ticks[-1].stamp_ns
 
 
 def test_text_of_a_session_is_no_markdown_in_the_summary(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
