@@ -77,11 +77,11 @@ class RrdExport:
         else:
             summary = document_of_run(session.path.stem, session.last, session.outcome)
         first = next(iter(shown.values()))
-        ticks = {prefix: _ended(each, each.ticks(with_frames=each is first)) for prefix, each in shown.items()}
+        ticks = {prefix: _with_end(each, each.ticks(with_frames=each is first)) for prefix, each in shown.items()}
         write_rrd(part, scene, ticks, progress, summary)
 
 
-def _ended(session: Session, ticks: Iterable[Tick]) -> Iterator[Tick]:
+def _with_end(session: Session, ticks: Iterable[Tick]) -> Iterator[Tick]:
     """The ticks; of a run that was stopped the last mission states the outcome, as the file does."""
     outcome, last = str(session.outcome.get("outcome") or ""), None
     for tick in ticks:

@@ -267,7 +267,7 @@ def test_the_last_tick_of_a_run_that_was_stopped_states_the_outcome_of_its_file(
     ticks: list[Tick], outcome: str, stated: str
 ) -> None:
     session = cast(Session, SimpleNamespace(outcome={"outcome": outcome}))
-    *before, last = rrd._ended(session, ticks)
+    *before, last = rrd._with_end(session, ticks)
     assert len(before) == len(ticks) - 1 and all(a is b for a, b in zip(before, ticks, strict=False))
     assert last.mission is not None and last.estimate is ticks[-1].estimate
     assert (last.mission.outcome, last.mission.finished) == (stated, bool(stated))
