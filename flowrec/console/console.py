@@ -62,7 +62,7 @@ class RunEnded(NamedTuple):
     Attributes
     ----------
     outcome : in a few words.
-    good : it reached its end, or was ended on purpose.
+    good : the mission was completed; green, as in all pictures, and else red.
     told : sentences as in all pictures, see `verdict_lines`; none where only the outcome is known.
     doubtful : its result is.
     """

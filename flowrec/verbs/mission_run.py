@@ -305,7 +305,8 @@ class _Mission:
         _report_remarks(writer)
         told = tuple(verdict_lines(self._facts, report.last.refined))
         files = files_text(self._output.path, tuple(writer.files))
-        return RunEnded(report.outcome, files, not bad, told, doubtful=DOUBTS in self._facts)
+        done = report.outcome in set(Outcome) and Outcome(report.outcome).completes_mission
+        return RunEnded(report.outcome, files, done, told, doubtful=DOUBTS in self._facts)
 
     def result(self) -> Recorded:
         """The result, after all is closed."""

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from flowrec.console import Console, RunEnded, refuse_without_packages
-from flowrec.core import DOUBTS, FlowrecError, Tick, UsageError, View, of_text, say, seconds, verdict_lines
+from flowrec.core import DOUBTS, FlowrecError, Outcome, Tick, UsageError, View, of_text, say, seconds, verdict_lines
 from flowrec.physics import Chip
 from flowrec.run import RemoteControl, Sink
 from flowrec.stages import ResolvedConfig
-from flowrec.verbs.run_summary import GOOD_ENDS
 
 if TYPE_CHECKING:
     from flowrec.view import LiveView
@@ -122,7 +121,8 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool =
         outcome, figures = run.outcome.get("outcome", "unknown"), of_text(run.outcome)
         text = f"the run has ended at {seconds(max(last.stamp_ns, 0)):.1f} s: {outcome}"
         told = tuple(verdict_lines(figures, last.refined))
-        ended = RunEnded(outcome, str(run.path), outcome in GOOD_ENDS, told, doubtful=bool(figures.get(DOUBTS)))
+        done = outcome in set(Outcome) and Outcome(outcome).completes_mission
+        ended = RunEnded(outcome, str(run.path), done, told, doubtful=bool(figures.get(DOUBTS)))
         say(f"{run.path}: {text}")
     finally:
         shown.close(ended)
