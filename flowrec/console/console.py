@@ -57,11 +57,21 @@ class CommandReply(NamedTuple):
 
 
 class RunEnded(NamedTuple):
-    """The last message to the console's process: how the run ended, and where its file is."""
+    """The last message to the console's process: how the run ended, and where its file is.
+
+    Attributes
+    ----------
+    outcome : in a few words.
+    good : the mission was completed; green, as in all pictures, and else red.
+    told : sentences as in all pictures, see `verdict_lines`; none where only the outcome is known.
+    doubtful : its result is.
+    """
 
     outcome: str
     files: str = ""
-    good: bool = False  # it reached its end, or was ended on purpose
+    good: bool = False
+    told: tuple[str, ...] = ()
+    doubtful: bool = False
 
 
 def refuse_without_packages() -> None:

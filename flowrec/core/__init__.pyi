@@ -23,7 +23,7 @@ from .declared_topics import (
 )
 from .diagnostics import CameraLosses as CameraLosses, Clocks as Clocks, Drops as Drops, Timing as Timing
 from .enums import (
-    Action as Action, Alarm as Alarm, AxesVerdict as AxesVerdict, Level as Level, Outcome as Outcome,
+    ALARM_WORDS as ALARM_WORDS, Action as Action, Alarm as Alarm, AxesVerdict as AxesVerdict, Level as Level, Outcome as Outcome,
     Phase as Phase, View as View, WorkOrder as WorkOrder,
 )
 from .errors import (
@@ -61,7 +61,8 @@ from .summary import (
     comparison_for_people as comparison_for_people, doubts_of as doubts_of, doubts_text as doubts_text,
     finite as finite, is_count as is_count, is_numeric as is_numeric, name_of as name_of, of_text as of_text,
     rows_for_people as rows_for_people, text_of_figure as text_of_figure,
-    flow_text as flow_text, way_text as way_text, with_micro as with_micro,
+    end_text as end_text, flow_text as flow_text, goal_text as goal_text, verdict_lines as verdict_lines,
+    way_text as way_text, with_micro as with_micro,
 )
 from .system.blas_threads import one_blas_thread as one_blas_thread
 from .system.bounded_process import BoundedProcess as BoundedProcess

@@ -104,3 +104,11 @@ class Alarm(StrEnum):
     NIS = "nis"
     PULSATION = "pulsation"
     TRACKING = "tracking"
+
+
+# Alarms in pictures and on pages.
+ALARM_WORDS: dict[str, str] = {
+    Alarm.NIS: "motion not explained",
+    Alarm.PULSATION: "flow pulsates",
+    Alarm.TRACKING: "robot often unseen",
+}

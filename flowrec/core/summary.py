@@ -5,6 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from flowrec.core.enums import Outcome
+
+if TYPE_CHECKING:
+    from flowrec.core.declarations import Floats
+    from flowrec.core.messages import FlowField
 
 Value = str | int | float | bool | None
 Figures = dict[str, Value]
@@ -18,6 +25,7 @@ _UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns
 _WHOLE = ("_bytes", "_ns")
 _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
+_ASSIMILATED = "assimilated "  # before the number of observations, at the begin of the note of a refined map
 _UM = re.compile(r"(?<![\w.])um\b")
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
 DOUBTS = "doubts"  # key of the outcome of a session: why its result is doubtful; absent: it is not
@@ -105,11 +113,25 @@ def text_of_figure(key: str, value: Value) -> str:
     return f"{value:.1f} {_UNITS[suffix]}"
 
 
+def end_text(figures: Mapping[str, Value]) -> str:
+    """Outcome of a run with its note and its duration, those that are known; '' without an outcome.
+
+    A replay ends with its recording, so its duration is none of its own.
+    """
+    if not figures.get("outcome"):
+        return ""
+    note = f" ({figures['note']})" if figures.get("note") else ""
+    duration = None if figures["outcome"] == Outcome.REPLAYED else figures.get("duration_s")
+    return f"{figures['outcome']}{note}" + ("" if duration is None else f" after {text_of_figure('_s', duration)}")
+
+
 def way_text(figures: Mapping[str, Value]) -> str:
     """The way to the goal, its time as planned and that on the shortest way; '' where nothing was navigated."""
     if any(figures.get(key) is None for key in ("route_length_um", "navigation_s", "planned_s")):
         return ""  # a file may state one without the other
     text = {key: text_of_figure(key, value) for key, value in figures.items()}
+    if figures.get("outcome") == Outcome.REPLAYED:  # its robot is that of the recording
+        return f"route of {text['route_length_um']} to the goal, planned {text['planned_s']}; it was not flown"
     way = f"{text['route_length_um']} to the goal in {text['navigation_s']}, planned {text['planned_s']}"
     if "shortest_way_um" in text:
         return f"{way}; the shortest way ({text['shortest_way_um']}) would take {text['shortest_way_s']}"
@@ -120,9 +142,9 @@ def flow_text(figures: Mapping[str, Value]) -> str:
     """Methods and errors of the maps, as assumed and refined, and the error that the last one states; '' without."""
     text = {key: text_of_figure(key, value) for key, value in figures.items() if value is not None}
     maps = [
-        " ".join(filter(None, (name, text.get(f"{name}_flow_error"), f"({text[f'{name}_method']})")))
+        " ".join(filter(None, (name, text.get(f"{name}_flow_error"), _in_brackets(text.get(f"{name}_method")))))
         for name in ("assumed", "refined")
-        if f"{name}_method" in text
+        if f"{name}_method" in text or f"{name}_flow_error" in text  # an older file states one without the other
     ]
     if not maps:
         return ""
@@ -133,9 +155,43 @@ def flow_text(figures: Mapping[str, Value]) -> str:
     return told
 
 
+def _in_brackets(text: str | None) -> str:
+    return f"({text})" if text else ""
+
+
+def goal_text(goal_um: Floats | None) -> str:
+    """The goal (2,) of a mission, um on the chip; 'none' without one, or where it is not finite."""
+    known = goal_um is not None and all(map(math.isfinite, goal_um))
+    return f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um" if known and goal_um is not None else "none"
+
+
+def learned_text(refined: FlowField | None) -> str:
+    """Findings of the last refinement, or the reason of its refusal; '' without a refinement."""
+    if refined is None:
+        return ""
+    if refined.refused:
+        return f"the refined flow was refused, the map in use stays: {refined.refused}"
+    first, _, rest = refined.note.partition("; ")
+    if first.startswith(_ASSIMILATED):
+        return f"learned from {first.removeprefix(_ASSIMILATED)}: {rest}" if rest else ""
+    return f"learned: {refined.note}" if first else ""
+
+
+def verdict_lines(figures: Mapping[str, Value], refined: FlowField | None = None) -> list[str]:
+    """Sentences of every picture and page about a run: its end, the reason, its doubts, the way, the flow, findings.
+
+    What is not known is left out. The first one begins with the outcome; units are spelt as in pictures.
+    """
+    doubts = [f"doubtful: {doubt}" for doubt in doubts_of(figures)]
+    ended, note = end_text({**figures, "note": ""}), str(figures.get("note") or "")
+    ended += ", doubtful" if ended and doubts else ""
+    told = [ended, note, *doubts, way_text(figures), flow_text(figures), learned_text(refined)]
+    return [with_micro(text[:1].upper() + text[1:]) for text in told if text]
+
+
 def with_micro(text: str) -> str:
-    """Text for a picture or a page: um, as a terminal and a file may have it, spelt as the axes of plots are."""
-    return _UM.sub("µm", text)
+    """Text for a picture or a page: um and +-, as a terminal and a file may have them, as µm and ±."""
+    return _UM.sub("µm", text).replace("+-", "±")
 
 
 def is_numeric(key: str) -> bool:

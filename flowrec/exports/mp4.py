@@ -10,6 +10,7 @@ more, the one before is shown longer. Without B-frames the file needs no edit li
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from fractions import Fraction
@@ -21,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, seconds
+from flowrec.core import DOUBTS, NS_PER_S, Frame, Tick, printable, seconds, verdict_lines
 from flowrec.exports.camera_images import GreyScale, first_frame, notes_of, refuse_windows, title_of, with_images
 from flowrec.exports.formats import TimeProgress
 from flowrec.movies import MovieNotes
@@ -52,15 +53,32 @@ class Mp4Export:
         grey = GreyScale.of(session, first)
         size_px = first.image.shape[1], first.image.shape[0]
         windows = WindowCompleter() if session.config.recording.region != "whole" else None
-        scene = Scene(session.chip, session.calibration, session.config.robot, "", image_px=size_px)
+        scene = Scene(
+            session.chip,
+            session.calibration,
+            session.config.robot,
+            "",
+            image_px=size_px,
+            doubts=str(session.outcome.get(DOUBTS) or ""),
+        )
         overlay = Overlay(scene, size_px)
         notes = notes_of(session, first, grey, drawn=True, zoom=overlay.zoom)
         with Mp4Writer(part, overlay.size_px, notes, session, full_range=False) as writer:
-            for tick, frame in with_images(session, progress):
+            ended = str(session.outcome.get("outcome") or "")
+            for (tick, frame), is_last in _with_last(with_images(session, progress)):
                 image = frame.image if windows is None else windows.complete(frame.image)
-                picture = overlay.draw(grey(image), tick)
+                picture = overlay.draw(grey(image), tick, ended if is_last else "")
                 planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8)
                 writer.write(frame.stamp_ns - first.stamp_ns, planes)
+
+
+def _with_last(images: Iterator[tuple[Tick, Frame]]) -> Iterator[tuple[tuple[Tick, Frame], bool]]:
+    """Each image, and whether it is the last one."""
+    now = next(images, None)
+    while now is not None:
+        after = next(images, None)
+        yield now, after is None
+        now = after
 
 
 class PlainMp4Export:
@@ -173,5 +191,6 @@ def _metadata(notes: MovieNotes, session: Session) -> dict[str, str]:
     ]
     if notes.first_stamp_ns:
         facts.append(f"begins {seconds(notes.first_stamp_ns):.9g} s after the start of the session")
+    facts += map(printable, verdict_lines(session.outcome, session.last.refined))
     texts = {"title": title_of(session), "comment": "; ".join(facts), "description": notes.text()}
     return texts | ({"creation_time": notes.started, "date": notes.started} if notes.started else {})

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.core import DOUBTS, RRD, SessionError
+from flowrec.core import DOUBTS, RRD, Outcome, SessionError, Tick, end_text, verdict_lines
 from flowrec.exports.formats import TimeProgress
 from flowrec.physics import Chip
 from flowrec.stages import ResolvedConfig, calibration_of
@@ -76,8 +77,23 @@ class RrdExport:
         else:
             summary = document_of_run(session.path.stem, session.last, session.outcome)
         first = next(iter(shown.values()))
-        ticks = {prefix: each.ticks(with_frames=each is first) for prefix, each in shown.items()}
+        ticks = {prefix: _with_end(each, each.ticks(with_frames=each is first)) for prefix, each in shown.items()}
         write_rrd(part, scene, ticks, progress, summary)
+
+
+def _with_end(session: Session, ticks: Iterable[Tick]) -> Iterator[Tick]:
+    """The ticks; of a run that was stopped the last mission states the outcome, as the file does."""
+    outcome, last = str(session.outcome.get("outcome") or ""), None
+    for tick in ticks:
+        if last is not None:
+            yield last
+        last = tick
+    if last is None:
+        return
+    mission = last.mission
+    if mission is not None and not mission.finished and outcome not in ("", Outcome.REPLAYED):
+        mission = replace(mission, finished=True, outcome=outcome, stamp_ns=last.stamp_ns, since_ns=last.stamp_ns)
+    yield replace(last, mission=mission)
 
 
 def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:
@@ -87,14 +103,19 @@ def _comparison(recorded: Session, replayed: Session) -> rr.TextDocument:
     rows = before_after(pair)
     told = [row for row in rows if row[0] not in _OF_COMMANDS]
     shown = [(key, was, now) for key, was, now in told if key != "planner" or was != now]
-    return summary_document(["recorded", "replayed"], shown, [registration_remark(pair.replayed.refined)])
+    ended = end_text({key: recorded.outcome.get(key) for key in ("outcome", "duration_s")}) or "its end is not known"
+    verdict = [f"Replay of {recorded.path.name}: {ended}", *verdict_lines({}, pair.replayed.refined)]
+    remarks = [doubts_remark(replayed.outcome), registration_remark(pair.replayed.refined)]
+    return summary_document(["recorded", "replayed"], shown, remarks, verdict)
 
 
 def _pair(first: Session, second: Session) -> rr.TextDocument:
     was, now = ({key: value for key, value, _ in rows_of_run(each.last, each.outcome)} for each in (first, second))
     named = list(zip(PAIR, (first, second), strict=True))
     notes = [remark(each.outcome, f"{name}: ") for remark in (doubts_remark, note_of) for name, each in named]
-    rows = [(key, was.get(key), now.get(key)) for key in ("goal", *FIGURES) if key in was or key in now]
+    rows = [
+        (key, was.get(key), now.get(key)) for key in (*FIGURES[:1], "goal", *FIGURES[1:]) if key in was or key in now
+    ]
     return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, notes)
 
 

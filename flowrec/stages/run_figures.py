@@ -10,6 +10,7 @@ import numpy as np
 from flowrec.core import FLOW_FIELDS, Demand, Figures, FlowField, Mission, Outcome, Phase, Route, Tick, finite, seconds
 from flowrec.physics import Chip, Robot, relative_rmse
 from flowrec.stages.planning.planner import Planner
+from flowrec.stages.planning.survey_ways import METHOD as SURVEY_ROUTE
 
 
 class RunStatistics:
@@ -63,7 +64,8 @@ def figures_of(
     figures: Figures = {"axes_check": last.axes.verdict} if last.axes is not None and last.axes.verdict else {}
     mission, route = last.mission, last.route
     flies = mission is not None and mission.phase in (Phase.NAVIGATE, Phase.DONE)
-    if mission is not None and route is not None and route.reachable and flies:
+    # A run that ends in its survey has a route, which leads to no goal.
+    if mission is not None and route is not None and route.reachable and flies and route.method != SURVEY_ROUTE:
         figures["planner"] = route.method
         figures["route_length_um"] = length_um(route)
         figures["planned_s"] = float(route.arrival_s[-1])

@@ -17,12 +17,15 @@ from flowrec.core import (
     NotFiniteError,
     SessionError,
     UsageError,
+    goal_text,
     nanoseconds,
     of_text,
     parse_toml,
     printable,
     rows_for_people,
     seconds,
+    verdict_lines,
+    with_micro,
 )
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run
@@ -41,7 +44,8 @@ if TYPE_CHECKING:
     from flowrec.store.tables import Tables
 
 _CARD_PX = 240  # width of the picture of a card
-_CARD_TEXT = 200  # characters of a value
+_CARD_TEXT, _CARD_SENTENCE = 200, 600  # characters of a value, of a sentence
+_CARD_FIGURES = ("tracking_error_um", "contacts", "frames_dropped", "covered")  # that no sentence states
 _LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
 
@@ -278,13 +282,15 @@ class Session:
 
     def _repr_html_(self) -> str:
         """A card for notebooks: how the run ended, with what, and the image in its middle, or the chip without one."""
-        frames = self.frames
+        frames, outcome, last = self.frames, self.outcome, self.last
         image = frames[len(frames) // 2].image if len(frames) else self.chip.mask.astype("uint8")
         recorded = {name: self.provenance.get(name, "") for name in ("wall_time", "operator", "sample", "notes")}
-        rows = [("chip", self.chip.name), *rows_for_people(self.outcome)]
+        goal = goal_text(last.mission.goal_um if last.mission is not None else None)
+        rows = [("goal", goal), ("chip", self.chip.name)]
+        rows += rows_for_people({key: outcome[key] for key in _CARD_FIGURES if key in outcome})
         rows += [(name.replace("_", " "), value) for name, value in recorded.items() if value]
         rows += [("topics", f"{len(self.topics)}, {sum(self.topics.values())} messages, {len(frames)} images")]
-        return card(self.path.name, rows, image)
+        return card(self.path.name, rows, image, verdict_lines(outcome, last.refined))
 
 
 def open(path: Path | str) -> Session:  # noqa: A001 - flowrec.open
@@ -345,31 +351,40 @@ def _absurd_numbers(session: Session) -> Iterator[str]:
                 yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or an impossibly large number"
 
 
-def card(title: str, rows: Iterable[tuple[str, str]], image: NDArray[np.uint8 | np.uint16] | None) -> str:
+def card(
+    title: str,
+    rows: Iterable[tuple[str, str]],
+    image: NDArray[np.uint8 | np.uint16] | None,
+    verdict: Iterable[str] = (),
+) -> str:
     """HTML without scripts and links.
 
     Parameters
     ----------
     rows : names and values, from a file, so not to be trusted.
     image : (h, w) grey levels, which are stretched to the full range; None: no picture.
+    verdict : sentences above the rows, likewise; the first one is bold.
     """
     cells = "".join(
         f'<tr><td style="text-align:left">{_escape(name)}</td><td style="text-align:left">{_escape(value)}</td></tr>'
         for name, value in rows
     )
-    picture = ""
-    if image is not None and image.size:
-        data = base64.b64encode(_thumbnail(image)).decode()
-        picture = f'<img alt="camera image" width="{_CARD_PX}" src="data:image/png;base64,{data}"/>'
+    data = base64.b64encode(_thumbnail(image)).decode() if image is not None and image.size else ""
+    picture = f'<img alt="camera image" width="{_CARD_PX}" src="data:image/png;base64,{data}"/>' if data else ""
+    sentences = "".join(
+        f"<div>{_escape(text, _CARD_SENTENCE) if number else f'<b>{_escape(text)}</b>'}</div>"
+        for number, text in enumerate(verdict)
+    )
     return (
         '<div style="display:flex;gap:1em;align-items:flex-start;border:1px solid #8888;border-radius:6px;padding:8px;'
-        f'max-width:52em">{picture}<div><b>{_escape(title)}</b><table>{cells}</table></div></div>'
+        f'max-width:52em">{picture}<div>{sentences}<div style="margin-top:4px">{_escape(title)}</div>'
+        f"<table>{cells}</table></div></div>"
     )
 
 
-def _escape(text: str) -> str:
-    shown = printable(text)
-    return html.escape(shown if len(shown) <= _CARD_TEXT else shown[: _CARD_TEXT - 2] + " …")
+def _escape(text: str, longest: int = _CARD_TEXT) -> str:
+    shown = with_micro(printable(text))
+    return html.escape(shown if len(shown) <= longest else shown[: longest - 2] + " …")
 
 
 def _thumbnail(image: NDArray[np.uint8 | np.uint16]) -> bytes:

@@ -27,7 +27,9 @@ from flowrec.core import (
     printable,
     say,
     table,
+    verdict_lines,
     warn,
+    with_micro,
 )
 from flowrec.run import CommandDifference, ReplayPair, RunControl, RunReport, before_after, work
 from flowrec.stages import Pipeline, ResolvedConfig
@@ -166,13 +168,13 @@ class BeforeAfter(tuple[Row, ...]):
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+            "<tr>" + "".join(f"<td>{html.escape(with_micro(cell))}</td>" for cell in row) + "</tr>"
             for row in comparison_for_people(self)
         )
         return f"<table><tr><th></th><th>recorded</th><th>replayed</th></tr>{rows}</table>"
 
 
-@dataclass
+@dataclass(repr=False)
 class Replay:
     """A replay: its comparison with the recording, and all of its messages.
 
@@ -218,6 +220,19 @@ class Replay:
         if self.file is None:
             raise UsageError("this verification wrote no session: it only compares")
         return Session(self.file)
+
+    def __repr__(self) -> str:
+        return f"Replay({str(self.session.path)!r}: {self.covered.text})"
+
+    def _repr_html_(self) -> str:
+        """Sentences as in all pictures and the table of changes; of a verification its conclusion and its lines."""
+        changed = self.worker is None
+        title = f"Replay of {self.session.path.name}: {self.covered.text}" if changed else self.lines()[-1]
+        doubts = [f"Doubtful: {doubt}" for doubt in self.doubts]
+        told = [*doubts, *verdict_lines({}, self.replayed.refined)] if changed else self.lines()[:-1]
+        sentences = "".join(f"<div>{html.escape(with_micro(printable(text)))}</div>" for text in told)
+        shown = self.before_after._repr_html_() if changed else ""
+        return f"<div><b>{html.escape(printable(title))}</b>{sentences}{shown}</div>"
 
     def table(self, topic: str) -> pa.Table:
         """All messages of one topic of the replay, as `Session.table`."""

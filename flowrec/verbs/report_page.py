@@ -12,6 +12,7 @@ from typing import Any
 
 from flowrec.core import (
     DOUBTS,
+    Figures,
     FlowField,
     Level,
     Outcome,
@@ -19,12 +20,13 @@ from flowrec.core import (
     OutputFolder,
     UsageError,
     doubts_of,
-    flow_text,
+    doubts_text,
+    goal_text,
     name_of,
     progress,
     say,
     text_of_figure,
-    way_text,
+    verdict_lines,
     with_micro,
 )
 from flowrec.exports import (
@@ -61,6 +63,7 @@ from flowrec.verbs.replay_change import OF_EVERY_REPLAY
 from flowrec.verbs.replay_result import refinement_remarks
 from flowrec.verbs.session_parts import flat
 from flowrec.verbs.verdict import Verdict
+from flowrec.view import goal_of
 
 _HIDDEN = frozenset(  # of the outcome: shown elsewhere
     {
@@ -178,21 +181,25 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
     judgement, *_ = verdict.lines()
     provenance = session.provenance
     packages = [(key.removeprefix("package."), text) for key, text in provenance.items() if key.startswith("package.")]
-    won = way_text(session.outcome), flow_text(session.outcome)
+    doubts = _doubts(data, verdict)
+    known: Figures = {"outcome": outcome, "duration_s": session.duration_s, DOUBTS: doubts_text(doubts)}
+    ended, *_ = verdict_lines(known)
+    _, *won = verdict_lines({**session.outcome, **known, "note": "", DOUBTS: ""}, data.refined)
     return Page(
         name=session.path.name,
         outcome=outcome,
+        ended=ended,
         good=any(outcome == each and each.completes_mission for each in Outcome) or outcome in _NEUTRAL,
         sentence=sentence(outcome),
-        note=_sentence(str(facts["note"] or "")),
-        won=[with_micro(text[:1].upper() + text[1:]) for text in map(str, won) if text],
-        doubts=_doubts(data, verdict),
-        about=_about(facts, session),
+        note=_sentence(with_micro(str(facts["note"] or ""))),
+        won=won,
+        doubts=doubts,
+        about=_about(facts, data),
         notes=[note for note in (str(facts.get("notes") or ""), *facts["notes_added"]) if note],
         key_figures=_key_figures(data),
         figures=done,
         refined=data.refined is not None,
-        refinement=_refinement(data),
+        refinement=_refinement(data.refined),
         boundary=_boundary(data),
         events=_events(data),
         recording=ReportTable("", [fact for fact in verdict.facts.items() if fact[0] not in ("written", "outcome")]),
@@ -211,7 +218,7 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
 def _doubts(data: ReportData, verdict: Verdict) -> list[str]:
     """Those that the session states, and those that its track shows."""
     found = (finding.text.removeprefix("doubtful: ") for finding in verdict.findings if finding.about == "doubts")
-    return list(dict.fromkeys([*doubts_of(data.session.outcome), *found]))
+    return [with_micro(doubt) for doubt in dict.fromkeys([*doubts_of(data.session.outcome), *found])]
 
 
 def _sentence(text: str) -> str:
@@ -219,14 +226,15 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + end
 
 
-def _about(facts: dict[str, Any], session: Session) -> str:
-    """Time, place and equipment of the run, in one line."""
+def _about(facts: dict[str, Any], data: ReportData) -> str:
+    """Time, place, equipment and goal of the run, in one line."""
+    goal = with_micro(f"goal {goal_text(goal_of(data.history.last.mission))}")
     rig = {"simulated": "in simulation", "movie": "from a movie", "lab": "in the laboratory"}
     when = f"{str(facts['recorded'])[:16].replace('T', ' ')} UTC"
     made = f"replay of {facts['replay_of']}, made {when}" if facts["replay_of"] else f"recorded {when}"
     where = rig.get(str(facts["rig"]), f"rig {facts['rig']}")
     named = (f"{key}: {facts[key]}" for key in ("operator", "sample") if facts.get(key))
-    return ", ".join([made, where, f"chip {facts['chip']}", f"{session.duration_s:.1f} s", *named])
+    return ", ".join([made, where, f"chip {facts['chip']}", goal, *named])
 
 
 def _maps(data: ReportData) -> dict[str, FlowField]:
@@ -272,20 +280,14 @@ def _boundary(data: ReportData) -> ReportTable | None:
     return ReportTable("At the openings of the chip", rows, ("", *fields))
 
 
-def _refinement(data: ReportData) -> list[str]:
-    """Result of the refinement or the reason of its refusal, and how both maps predict what was held back."""
-    refined = data.refined
-    if refined is None:
-        return []
-    found = refined.note.split("; ") if refined.note else []
-    if refined.refused:
-        found = [f"refused, the map in use stays: {refined.refused}"]
-    if refined.log_score is not None and refined.log_score_before is not None:
-        found.append(
-            f"log score of observations that were held back {refined.log_score:.2f}, by the map in use before "
-            f"{refined.log_score_before:.2f}"
-        )
-    return found
+def _refinement(refined: FlowField | None) -> str:
+    """Prediction of what was held back by the refined map and by the map before it; '' where it is not known."""
+    if refined is None or refined.log_score is None or refined.log_score_before is None:
+        return ""
+    return (
+        f"Log score of observations that were held back: {refined.log_score:.2f}, by the map in use before "
+        f"{refined.log_score_before:.2f}."
+    )
 
 
 def _events(data: ReportData) -> list[ReportTable]:
@@ -340,7 +342,7 @@ def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
         ReportTable("Before and after", texts, ("", "recorded", "replayed", ""), narrow_columns=3),
         ReportTable("What was changed", changed, of_changed, note),
     ]
-    return ReplayPart(pair.replay.path.name, tables, refinement_remarks(pair), figure)
+    return ReplayPart(pair.replay.path.name, tables, [*map(with_micro, refinement_remarks(pair))], figure)
 
 
 def _changed_settings(pair: ReplayFiles) -> list[tuple[str, str, str]]:

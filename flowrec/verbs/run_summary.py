@@ -13,6 +13,7 @@ from flowrec.core import (
     FlowField,
     Outcome,
     doubts_of,
+    end_text,
     flow_text,
     name_of,
     say,
@@ -93,9 +94,7 @@ class Recorded:
     def lines(self) -> list[str]:
         """The end of the run and what was won, as text: outcome, way, flow, files; what is not known is left out."""
         facts = self.facts
-        note = f" ({facts['note']})" if facts.get("note") else ""
-        duration, wall = (text_of_figure(key, facts[key]) for key in ("duration_s", "wall_s"))
-        ended = f"{facts['outcome']}{note} after {duration}, computed in {wall}"
+        ended = f"{end_text(facts)}, computed in {text_of_figure('wall_s', facts['wall_s'])}"
         also = [f"{name_of(key)}: {text_of_figure(key, facts[key])}" for key in _ALSO if facts.get(key)]
         won = ["; ".join(filter(None, (ended, way_text(facts)))), flow_text(facts)]
         return [*filter(None, won), *also, f"file: {files_text(self.path, self.files)}"]

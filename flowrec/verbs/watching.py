@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from flowrec.console import Console, RunEnded, refuse_without_packages
-from flowrec.core import FlowrecError, UsageError, View, say, seconds
+from flowrec.core import DOUBTS, FlowrecError, Outcome, Tick, UsageError, View, of_text, say, seconds, verdict_lines
 from flowrec.physics import Chip
 from flowrec.run import RemoteControl, Sink
 from flowrec.stages import ResolvedConfig
-from flowrec.verbs.run_summary import GOOD_ENDS
 
 if TYPE_CHECKING:
     from flowrec.view import LiveView
@@ -110,7 +109,7 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool =
     run = GrowingRun(path)
     obey = RemoteControl(run.path).obey if console else None
     remarks = {"duration_s": run.config.duration_s}
-    last_ns = 0
+    last = Tick()
     ended = RunEnded("this page was closed; the run goes on", good=True)
     shown = Watching(mode, (run.config, run.chip, run.path), obey, lambda: remarks)
     try:
@@ -118,10 +117,12 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool =
         for tick in run.ticks():
             for sink in shown.sinks:
                 sink.write(tick)
-            last_ns = tick.stamp_ns
-        outcome = run.outcome.get("outcome", "unknown")
-        text = f"the run has ended at {seconds(last_ns):.1f} s: {outcome}"
-        ended = RunEnded(text, str(run.path), good=outcome in GOOD_ENDS)
+            last = tick
+        outcome, figures = run.outcome.get("outcome", "unknown"), of_text(run.outcome)
+        text = f"the run has ended at {seconds(max(last.stamp_ns, 0)):.1f} s: {outcome}"
+        told = tuple(verdict_lines(figures, last.refined))
+        done = outcome in set(Outcome) and Outcome(outcome).completes_mission
+        ended = RunEnded(outcome, str(run.path), done, told, doubtful=bool(figures.get(DOUBTS)))
         say(f"{run.path}: {text}")
     finally:
         shown.close(ended)

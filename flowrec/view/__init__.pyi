@@ -1,7 +1,7 @@
 from . import viewer as viewer
 from .bare_blueprint import bare_blueprint as bare_blueprint
 from .bare_plots import plot_of as plot_of
-from .colours import ColourScale as ColourScale, round_below as round_below
+from .colours import ColourScale as ColourScale, OF_PHASE as OF_PHASE, round_below as round_below
 from .drawing import WindowCompleter as WindowCompleter, encode_jpeg as encode_jpeg
 from .entities import PAIR as PAIR, REPLAY as REPLAY
 from .feed import Batch as Batch, Feed as Feed, FeedSink as FeedSink, read_feed as read_feed
@@ -13,7 +13,7 @@ from .foxglove_layout import foxglove_layout as foxglove_layout
 from .live import LiveView as LiveView
 from .overlay import Overlay as Overlay
 from .rrd_file import APPLICATION as APPLICATION, is_made_from as is_made_from, write_rrd as write_rrd
-from .scene import Box as Box, Scene as Scene, goal_of as goal_of, way_of as way_of
+from .scene import Box as Box, Scene as Scene, goal_of as goal_of, place_on_chip as place_on_chip, way_of as way_of
 from .screenshot import screenshot as screenshot
 from .status_bar import length_text as length_text, state_text as state_text
 from .summary_text import (

@@ -27,6 +27,8 @@ _FEW_LANES, _MOST_LANES = 2, 5  # more than few make the area below higher; more
 _MOST_EXTRA = 6  # plots of extra topics beside each other
 _TITLE_PX = 28.0
 _LEGEND_LIVE_S = 6.0  # least time kept free for a legend in a view that follows the run
+_WITH_LEGEND = 1.5  # width of a plot with a legend over that of one without
+_LEGEND_OF_TWO = 0.5  # as LEGEND, in a view of two sessions, where all plots have one
 LEGEND = 0.35  # of the time shown, kept free for a legend beside the curves, in all plots alike
 Shown = rrb.View | rrb.Container
 Part = Shown | None
@@ -110,14 +112,20 @@ class _Views:
 
     def _time_axis(self) -> rrb.TimeAxis:
         """From the start to the end, and longer for the legend."""
-        end = rr.TimeRangeBoundary.absolute(seconds=(1.0 + LEGEND) * self.end_s)
+        free = LEGEND if len(self.prefixes) == 1 else _LEGEND_OF_TWO
+        end = rr.TimeRangeBoundary.absolute(seconds=(1.0 + free) * self.end_s)
         if self.live:
-            end = rr.TimeRangeBoundary.cursor_relative(seconds=max(LEGEND * self.end_s, _LEGEND_LIVE_S))
+            end = rr.TimeRangeBoundary.cursor_relative(seconds=max(free * self.end_s, _LEGEND_LIVE_S))
         return axis_of(rr.TimeRangeBoundary.absolute(seconds=0.0), end)
 
     def lanes(self) -> Shown:
-        """The timeline of states."""
-        return rrb.StateTimelineView(name=self._lanes_name(), origin="/", contents=_contents(self._lane_paths))
+        """The timeline of states, all of it, on the axis of the plots."""
+        return rrb.StateTimelineView(
+            name=self._lanes_name(),
+            origin="/",
+            contents=_contents(self._lane_paths),
+            time_view=self._time_axis(),
+        )
 
     @property
     def _lane_paths(self) -> list[str]:
@@ -238,6 +246,7 @@ def _plots(v: _Views) -> tuple[Part, ...]:
             *flow,
             v.plot("Tracking error (µm)", e.TRACKING_ERROR),
             frequency if single else None,
+            first_share=_WITH_LEGEND if single else 1.0,
         ),
         _row(
             "Observer",
@@ -296,10 +305,10 @@ def tabs(*parts: Part) -> Part:
     return rrb.Tabs(*found, active_tab=0) if found else None
 
 
-def _row(name: str, *parts: Part) -> Part:
-    """Views side by side."""
+def _row(name: str, *parts: Part, first_share: float = 1.0) -> Part:
+    """Views side by side, the first one wider by a factor."""
     found = existing(parts)
-    return rrb.Horizontal(*found, name=name) if found else None
+    return rrb.Horizontal(*found, name=name, column_shares=[first_share, *[1.0] * (len(found) - 1)]) if found else None
 
 
 def _contents(paths: Iterable[str]) -> list[str]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import Floats
+from flowrec.core import Floats, Phase
 
 Rgb = tuple[int, int, int]
 Table = Literal["speed", "uncertainty", "change", "time", "arrows"]
@@ -27,6 +27,15 @@ PURPLE: Rgb = (196, 140, 255)
 GREY: Rgb = (150, 150, 158)
 PALE: Rgb = (206, 206, 212)
 WHITE: Rgb = (236, 236, 240)
+# Of a phase of the mission, in all pictures; the report has tints of them. The others are grey.
+OF_PHASE: dict[str, Rgb] = {
+    Phase.SURVEY: PURPLE,
+    Phase.REFINE: BLUE,
+    Phase.PLAN: YELLOW,
+    Phase.NAVIGATE: ORANGE,
+    Phase.OBSERVE: PURPLE,
+    Phase.DONE: GREEN,
+}
 # Of arrows over a camera's grey image: all of them light.
 _LIGHT = np.array([(222, 236, 255), (255, 252, 214), (255, 236, 96)], np.float64)
 # Of a change: blue, almost white at zero, red.

@@ -8,6 +8,7 @@ import numpy as np
 import rerun as rr
 
 from flowrec.core import (
+    Applied,
     Currents,
     Demand,
     Estimate,
@@ -19,6 +20,7 @@ from flowrec.core import (
     Message,
     Mission,
     OperatorEvent,
+    Phase,
     Route,
     Tick,
     Timing,
@@ -40,7 +42,7 @@ _TRAIL_STEP_PX = 1.0
 _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 _SHOWN = (  # fields of a tick, in the order in which they are logged
-    *("route", "mission", "track", "estimate", "demand", "currents"),
+    *("route", "mission", "track", "estimate", "demand", "applied", "currents"),
     *("health", "timing", "event", "operator", "drops", "losses"),
 )
 _WORD_SHARE = 0.16, 0.12  # of the view: half the width, and the height, of the longest word about the robot
@@ -104,7 +106,7 @@ class TickLogger:
         self.states.end_marks(tick.stamp_ns)
         if tick.frame is not None and tick.frame is not self._last.frame:
             self._log_image(tick.frame)
-        self._flow.log_not_yet(tick.refined, self._last)
+        self._flow.log_not_yet(tick, self._last)
         self._flow.log_fields(tick, self._last)
         for message in tick.news(self._last, _SHOWN).values():
             self._log_message(message)
@@ -126,11 +128,11 @@ class TickLogger:
                 self._log_estimate(message)
             case Demand():
                 self._log_demand(message)
-            case Currents():
+            case Applied() if self._observes:  # nothing is commanded: the log of a movie says what the coils did
+                self._log_field(message)
+            case Currents() if not self._observes:
                 # The currents themselves oscillate at this frequency, too fast to be drawn from a sample a frame.
-                self._scalars(e.AMPLITUDE, message.amplitude_mt)
-                self._scalars(e.FREQUENCY, message.frequency_hz)
-                self._scalars(e.HEADING, math.degrees(message.heading_rad))
+                self._log_field(message)
             case Health():
                 if math.isfinite(message.nis):
                     self._scalars(e.NIS_MEAN, message.nis)
@@ -143,6 +145,15 @@ class TickLogger:
             case OperatorEvent():
                 said = f": {message.text}" if message.text else ""
                 self._log_text(e.OPERATOR, f"operator: {message.action}{said}", "INFO")
+
+    @property
+    def _observes(self) -> bool:
+        return self._tick.mission is not None and self._tick.mission.phase == Phase.OBSERVE
+
+    def _log_field(self, message: Applied | Currents) -> None:
+        self._scalars(e.AMPLITUDE, message.amplitude_mt)
+        self._scalars(e.FREQUENCY, message.frequency_hz)
+        self._scalars(e.HEADING, math.degrees(message.heading_rad))
 
     def _log_extra(self, path: str, message: Message) -> None:
         """The floats of a message as lines over time, a vector as a line an element."""

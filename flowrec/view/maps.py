@@ -20,6 +20,7 @@ from flowrec.view.colours import ColourScale
 from flowrec.view.entities import EntityLogger, label, points
 from flowrec.view.scene import Scene
 
+_NOT_YET = {"assumed": "not computed yet", "refined": "not refined yet"}  # by the field of a tick
 _MAPS = {"assumed": e.ASSUMED, "refined": e.REFINED, "true_field": e.TRUE}  # of speed, by field of a tick
 _ARROW_POINTS = 1.6  # half the width of the shaft; Rerun draws a head in proportion
 _BAR_ROWS = 256
@@ -122,15 +123,16 @@ class FlowLogger:
         for entity in e.SCALES:
             self._log(entity, transform_of(scene.mask_to_plane()), static=True)
 
-    def log_not_yet(self, refined: FlowField | None, last: Tick) -> None:
-        """Label the maps that wait for a refinement, and remove the label when it has arrived."""
-        for entity in (e.REFINED, e.CHANGE):
+    def log_not_yet(self, tick: Tick, last: Tick) -> None:
+        """Label the maps that come later, and remove the label when one has arrived."""
+        for entity, name in ((e.ASSUMED, "assumed"), (e.REFINED, "refined"), (e.CHANGE, "refined")):
+            field, before = getattr(tick, name), getattr(last, name)
             beside = f"{entity.rsplit('/', 1)[0]}/{e.NOT_YET}"
-            if refined is None and last.stamp_ns < 0:
+            if field is None and last.stamp_ns < 0:
                 left, top, right, bottom = self._scene.fluid_bounds()
                 centre = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
-                self._log(beside, label(centre, "not refined yet", colours.PALE))
-            elif refined is not None and last.refined is None:
+                self._log(beside, label(centre, _NOT_YET[name], colours.PALE))
+            elif field is not None and before is None:
                 self._entities.clear(beside)
 
     def log_fields(self, tick: Tick, last: Tick) -> None:

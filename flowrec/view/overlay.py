@@ -63,8 +63,11 @@ class Overlay:
         self._tick = Tick()
         self._layer = self._redraw(self._tick)
 
-    def draw(self, image: NDArray[np.uint8], tick: Tick) -> Picture:
-        """The picture in BGR of an image (h, w) of 8 bits and its tick; it is valid until the next call."""
+    def draw(self, image: NDArray[np.uint8], tick: Tick, ended: str = "") -> Picture:
+        """The picture in BGR of an image (h, w) of 8 bits and its tick; it is valid until the next call.
+
+        `ended` is, of the last image, the outcome of the run, which a mission that was stopped does not state.
+        """
         last, self._tick = self._tick, tick
         if _content_key(tick) != _content_key(last):
             self._layer = self._redraw(tick)
@@ -79,7 +82,7 @@ class Overlay:
         canvas = self._canvas
         canvas[: self._height, : self._width] = picture
         canvas[: self._height, self._width :] = picture[:, -1:]
-        self._status_bar.draw(canvas[self._height :], tick)
+        self._status_bar.draw(canvas[self._height :], tick, ended, doubtful=bool(self._scene.doubts))
         return canvas
 
     def _to_px(self, plane: Floats) -> Floats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import rerun as rr
 
 from flowrec.core import (
+    ALARM_WORDS,
     NS_PER_S,
     Action,
     Alarm,
@@ -15,7 +16,6 @@ from flowrec.core import (
     Mission,
     OperatorEvent,
     Outcome,
-    Phase,
     Track,
 )
 from flowrec.view import colours
@@ -28,16 +28,6 @@ _STATES = 200  # of a lane that have a colour of their own: a session of hours m
 _PHASES = 9  # that have a name in `StateLogger.phases`
 _WITH_TEXT = (Action.MARK, Action.NOTE, Action.GOAL, Action.SPEED)
 _LETTERS = 40  # of a mark's text
-_PHASE_COLOURS: dict[str, Rgb] = {
-    Phase.SURVEY: colours.PURPLE,
-    Phase.REFINE: colours.BLUE,
-    Phase.PLAN: colours.YELLOW,
-    Phase.NAVIGATE: colours.ORANGE,
-    Phase.OBSERVE: colours.PURPLE,
-    Phase.DONE: colours.GREEN,
-}
-# That the robot is not seen has a lane of its own.
-_ALARMS = {Alarm.NIS.value: "inconsistent (NIS)", Alarm.PULSATION.value: "flow pulsates", Alarm.TRACKING.value: ""}
 _NONE = ""  # a state that is not drawn
 
 
@@ -60,8 +50,9 @@ class StateLogger:
             case Track():
                 self._log_state(e.SIGHT, _NONE if message.seen else "Not seen", colours.RED)
             case Health():
-                words = [_ALARMS.get(word, word) for word in message.alarm.split("; ") if word]
-                self._log_state(e.ALARM, ", ".join(word for word in words if word), colours.RED)
+                # That the robot is not seen has a lane of its own.
+                alarms = [name for name in message.alarm.split("; ") if name and name != Alarm.TRACKING]
+                self._log_state(e.ALARM, ", ".join(ALARM_WORDS.get(name, name) for name in alarms), colours.RED)
             case OperatorEvent(action=action, text=said):
                 text = f"{action} {said}" if action in (Action.GOAL, Action.SPEED) else said
                 self._mark_ends_ns = message.stamp_ns + _MARK_NS
@@ -74,7 +65,7 @@ class StateLogger:
 
     def _log_mission(self, mission: Mission) -> None:
         """The phase, and at the end the outcome."""
-        name, colour = mission.phase, _PHASE_COLOURS.get(mission.phase, colours.GREY)
+        name, colour = mission.phase, colours.OF_PHASE.get(mission.phase, colours.GREY)
         if mission.finished and mission.outcome:
             name = mission.outcome
             done = name in set(Outcome) and Outcome(name).completes_mission

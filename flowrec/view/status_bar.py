@@ -70,13 +70,18 @@ class StatusBar:
             self._parts.append(self._part(tip[0, 0], f"{words} {speed:g} µm/s", FLOW, *arrow, width=0.8))
         self._parts.append(self._scale_bar())
 
-    def draw(self, bar: Picture, tick: Tick) -> None:
-        """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first."""
+    def draw(self, bar: Picture, tick: Tick, ended: str = "", *, doubtful: bool = False) -> None:
+        """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first.
+
+        `ended` and `doubtful` are outcome and verdict of a run that is over.
+        """
         bar[:] = bgr(_GROUND)
         left = round(0.6 * self._letter)
         left += self._write(bar, _clock_mask(clock_text(seconds(tick.stamp_ns)), self._letter), left)
         left += round(0.9 * self._letter)
-        left += self._write(bar, _text_mask(state_text(tick.mission, tick.estimate), self._letter), left)
+        left += self._write(
+            bar, _text_mask(state_text(tick.mission, tick.estimate, ended, doubtful=doubtful), self._letter), left
+        )
         right = bar.shape[1]
         for part in reversed(self._parts):
             begin = right - part.shape[1]
@@ -137,16 +142,18 @@ def length_text(length_um: float) -> str:
     return f"{length_um / 1e3:g} mm" if length_um >= 1e3 else f"{length_um:g} µm"
 
 
-def state_text(mission: Mission | None, estimate: Estimate | None) -> str:
-    """Current state of the mission, in a few words."""
-    words = ""
+def state_text(mission: Mission | None, estimate: Estimate | None, ended: str = "", *, doubtful: bool = False) -> str:
+    """Current state of the mission, in a few words; of a run that has `ended`, its outcome, and if it is doubtful."""
+    words = ended
     if mission is not None:
         if mission.finished:
             words = mission.outcome or "done"
-        elif mission.held_since_ns is not None:
+        elif mission.held_since_ns is not None and not ended:
             words = "held by the operator"
-        else:
+        elif not ended:
             words = mission.phase
+    if doubtful and (ended or (mission is not None and mission.finished)):
+        words += ", doubtful"
     if estimate is not None and not estimate.seen:
         words += ", robot not seen" if words else "robot not seen"
     words = printable(words)

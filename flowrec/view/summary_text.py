@@ -17,8 +17,12 @@ from flowrec.core import (
     Value,
     comparison_for_people,
     doubts_text,
+    flow_text,
+    goal_text,
     printable,
     seconds,
+    verdict_lines,
+    way_text,
     with_micro,
 )
 from flowrec.physics import on_chip
@@ -26,7 +30,7 @@ from flowrec.stages import MotionOfRun, RunStatistics, TrackQuality, figures_of
 from flowrec.view.scene import Scene, goal_of
 
 _MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\`*_{}[]()<>#+!|~"})
-_LETTERS = 200  # of one cell: names and notes come from the file
+_LETTERS, _LONGEST = 200, 600  # of a cell, and of a sentence: names and notes come from the file
 # Figures of a run in the text panel, in this order. The panel has room for eleven rows.
 FIGURES = (
     "outcome",
@@ -42,13 +46,19 @@ FIGURES = (
     "contacts",
     "frames_dropped",
 )
+# Of them, what the sentences above the table state.
+_IN_END = ("outcome", "duration_s")
+_IN_WAY = ("navigation_s", "planned_s")
+_IN_FLOW = ("assumed_flow_error", "refined_flow_error", "stated_flow_error")
 _AT_ZERO = ("contacts",)  # counts that are shown also where they are 0
 _USUAL = ("axes_check", AxesVerdict.AGREES)  # is not shown
 _NEWS = ("mission", "route", "drops", "true_field", *FLOW_FIELDS)  # messages that bring another fact
 
 
-def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Iterable[str]) -> rr.TextDocument:
-    """A table with one or two columns of values, then the remarks as paragraphs; '' is none.
+def summary_document(
+    columns: Sequence[str], rows: Iterable[Row], remarks: Iterable[str], verdict: Iterable[str] = ()
+) -> rr.TextDocument:
+    """Sentences below the first one as a heading, a table with one or two columns of values, then remarks; '' is none.
 
     Rows are key and values, as flowrec.core.summary reads them; of one column the second value is not shown.
     """
@@ -56,26 +66,32 @@ def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Itera
     lines = [[_cell(each) for each in row] for row in (["", *columns], *cells)]
     lines.insert(1, ["---"] + ["---:"] * len(columns))
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    text = "\n\n".join([table, *(_cell(remark) for remark in remarks if remark)])
-    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+    return _document([*_sentences(verdict), table, *(_cell(remark, _LONGEST) for remark in remarks if remark)])
+
+
+def _sentences(verdict: Iterable[str]) -> list[str]:
+    return [f"{'' if number else '### '}{_cell(text, _LONGEST)}" for number, text in enumerate(verdict)]
+
+
+def _document(paragraphs: Iterable[str]) -> rr.TextDocument:
+    return rr.TextDocument("\n\n".join(paragraphs), media_type=rr.MediaType.MARKDOWN)
 
 
 def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
     """Outcome, goal and figures of one run; those that are not known are left out."""
-    goal_um = goal_of(last.mission)
-    goal: Row = ("goal", "none" if goal_um is None else f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um", None)
+    goal: Row = ("goal", goal_text(goal_of(last.mission)), None)
     known = [key for key in FIGURES if figures.get(key) not in (None, "") and (key, figures[key]) != _USUAL]
     rows: list[Row] = [(key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO]
     return [*rows[:1], goal, *rows[1:]] if "outcome" in known else [goal, *rows]
 
 
 def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.TextDocument:
-    """The panel of one run, finished or not."""
-    return summary_document(
-        [title],
-        rows_of_run(last, figures),
-        [doubts_remark(figures), note_of(figures), registration_remark(last.refined)],
-    )
+    """The panel of one run, finished or not: its outcome, a line of figures that no sentence states, the sentences."""
+    said = {*_IN_END, *(_IN_WAY if way_text(figures) else ()), *(_IN_FLOW if flow_text(figures) else ())}
+    rows = comparison_for_people(row for row in rows_of_run(last, figures) if row[0] not in said)
+    about = "; ".join([f"session {title}", *(f"{name} {value}" for name, value, _ in rows)])
+    ended, *told = verdict_lines({"outcome": "its end is not known", **figures}, last.refined)
+    return _document(_sentences(filter(None, [ended, about, *told, registration_remark(last.refined)])))
 
 
 def doubts_remark(figures: Mapping[str, Value], whose: str = "") -> str:
@@ -91,7 +107,10 @@ def note_of(figures: Mapping[str, Value], whose: str = "") -> str:
 
 
 class LiveSummary:
-    """Summary panel of a run that is under way; at its end it states what the panel of its session states."""
+    """Summary panel of a run that is under way; at its end it states what the panel of its session states.
+
+    But for the shortest way, which is planned after the end.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -141,10 +160,11 @@ def registration_remark(refined: FlowField | None) -> str:
         return ""
     height, width = refined.pressure_pa.shape
     middle_um = 0.5 * refined.um_per_px * np.array([width - 1.0, height - 1.0])
-    x_um, y_um = (on_chip(refined.registration, middle_um) - middle_um).tolist()
+    x_um, y_um = (on_chip(refined.registration, middle_um) - middle_um).round(1) + 0.0  # -0.0 becomes 0.0
     return f"Found registration: picture moved by ({x_um:.1f}, {y_um:.1f}) um"
 
 
-def _cell(text: str) -> str:
+def _cell(text: str, letters: int = _LETTERS) -> str:
     """Text as it is, without Markdown, HTML or control characters."""
-    return with_micro(printable(text))[:_LETTERS].translate(_MARKDOWN)
+    shown = with_micro(printable(text))
+    return (shown if len(shown) <= letters else shown[: letters - 2] + " …").translate(_MARKDOWN)

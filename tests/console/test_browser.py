@@ -136,6 +136,8 @@ def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
     event("goal set to").wait_for()
     page.get_by_role("button", name=re.compile("^STOP")).click()
     page.locator("#alert", has_text=str(out)).wait_for()
+    assert not page.locator("#alert").get_attribute("class"), "red, as in all pictures: it was not completed"
+    assert re.match(r"Stopped after \d+\.\d s\.", page.locator("#alert").inner_text())
     assert page.get_by_role("button", name=re.compile("^STOP")).is_disabled()
     text, _ = run.communicate(timeout=HANG_S)
     assert run.returncode == 0, text

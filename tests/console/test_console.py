@@ -396,9 +396,11 @@ def test_the_end_is_shown_and_the_server_ends(scene: Scene, ticks: Ticks) -> Non
         pid = served.console.pid
         for tick in ticks(3):
             served.console.write(tick)
-        served.console.close(RunEnded("reached", "a.mcap (1 MB)", good=True))
+        told = ("Reached after 35.1 s", "Doubtful: axes")
+        served.console.close(RunEnded("reached", "a.mcap (1 MB)", good=True, told=told, doubtful=True))
         words = json.loads([each for each in page if isinstance(each, str)][-1])
-        assert words["ended"] == {"outcome": "reached", "files": "a.mcap (1 MB)", "good": True}
+        ended = {"outcome": "reached", "files": "a.mcap (1 MB)", "good": True, "told": [*told], "doubtful": True}
+        assert words["ended"] == ended
         assert words["state"]["time_s"] == 0.03
     until(lambda: not psutil.pid_exists(pid or 0))
     assert served.told == []

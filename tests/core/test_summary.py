@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from flowrec.core.summary import Value, of_text, way_text, with_micro
+from flowrec.core.summary import Value, of_text, verdict_lines, way_text, with_micro
 from flowrec.store.reader import SessionReader
 from flowrec.store.session import Session
 from flowrec.verbs.cli import main
@@ -128,10 +129,34 @@ def test_a_new_file_holds_the_count_of_dropped_frames_once_and_readers_take_the_
 def test_what_a_file_states_of_the_way_in_part_only_is_no_sentence() -> None:
     whole: dict[str, Value] = {"route_length_um": 7190.0, "navigation_s": 23.0, "planned_s": 23.1}
     assert way_text(whole) == "7.19 mm to the goal in 23.0 s, planned 23.1 s"
+    replayed = verdict_lines(whole | {"outcome": "replayed", "note": "replay of a.mcap", "duration_s": 35.1})
+    way = "Route of 7.19 mm to the goal, planned 23.1 s; it was not flown"
+    assert replayed == ["Replayed", "Replay of a.mcap", way]
     for key in whole:
         assert way_text({name: value for name, value in whole.items() if name != key}) == ""
 
 
+def test_pictures_tell_the_end_first_then_the_reason_the_doubts_what_was_won_and_what_was_learned() -> None:
+    figures: dict[str, Value] = {"outcome": "lost", "note": "at 5 um", "duration_s": 16.2, "doubts": "axes; scale"}
+    flow: dict[str, Value] = {"assumed_method": "fvm", "assumed_flow_error": 0.089}
+    refined = Session(GOLDEN).last.refined
+    assert refined is not None
+    found = replace(refined, note="assimilated 53 observations; it moves 10 +- 2 % less")
+    assert verdict_lines(figures | flow, found) == [
+        "Lost after 16.2 s, doubtful",
+        "At 5 µm",
+        "Doubtful: axes",
+        "Doubtful: scale",
+        "Flow error: assumed 8.9 % (fvm)",
+        "Learned from 53 observations: it moves 10 ± 2 % less",
+    ]
+    assert verdict_lines({}, replace(found, refused="no light")) == [
+        "The refined flow was refused, the map in use stays: no light"
+    ]
+    assert verdict_lines({}, replace(found, note="assimilated 53 observations")) == verdict_lines({}) == []
+
+
 def test_pictures_and_pages_spell_micrometres_as_axes_do_and_leave_names_alone() -> None:
     assert with_micro("(240, 2700) um, 15.5 um/s, um per revolution") == "(240, 2700) µm, 15.5 µm/s, µm per revolution"
+    assert with_micro("10 +- 2 %") == "10 ± 2 %"
     assert with_micro("robot.radius_um = 3, sum, um_per_px, a.um") == "robot.radius_um = 3, sum, um_per_px, a.um"

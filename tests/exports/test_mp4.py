@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from flowrec.core.messages import Applied, Frame
 from flowrec.core.topics import Tick
 from flowrec.exports import mp4
 from flowrec.exports.camera_images import with_images
+from flowrec.view.status_bar import state_text
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 STAMPS_NS = [0, 33_333_333, 66_666_667, 500_000_001, 533_333_333]  # one interval is a loss
@@ -112,6 +114,28 @@ def test_the_file_is_what_players_open_and_states_scale_time_and_session(session
     scale = session.config.camera.um_per_px / 3
     assert f"{scale:.6g} um per pixel" in metadata["comment"]  # the picture is enlarged by 3
     assert metadata["creation_time"][:19] == session.provenance["wall_time"][:19]
+
+
+def test_the_last_image_and_the_notes_of_the_file_state_how_the_run_ended(session, tmp_path, monkeypatch):
+    told = []
+    draw = mp4.Overlay.draw
+
+    def spied(self, image, tick, ended=""):
+        told.append((ended, self._scene.doubts))
+        return draw(self, image, tick, ended)
+
+    monkeypatch.setattr(mp4.Overlay, "draw", spied)
+    stopped = OfTicks(session, made(repeated=[2]))
+    stopped.outcome = {"outcome": "time over", "duration_s": 0.6, "doubts": "axes"}
+    _, metadata, _ = read(written(mp4.Mp4Export(), stopped, tmp_path / "x.mp4"))
+    assert told == [("", "axes")] * 3 + [("time over", "axes")]
+    assert "Time over after 0.6 s, doubtful; Doubtful: axes" in metadata["comment"]
+    mission = session.last.mission
+    assert mission.finished and mission.outcome == "reached"
+    assert state_text(mission, None, doubtful=True) == "reached, doubtful"
+    under_way = replace(mission, finished=False, outcome="", phase="navigate")
+    assert state_text(under_way, None, doubtful=True) == "navigate"
+    assert state_text(under_way, None, "time over", doubtful=True) == "time over, doubtful"
 
 
 @pytest.mark.slow("draws a movie")

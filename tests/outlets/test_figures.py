@@ -94,7 +94,9 @@ def test_the_maps_have_the_speed_of_each_pixel_in_um_per_second(data: ReportData
     figure = MapFigure().draw(data, WIDE_MM)
     maps = {ax.get_title().partition(" (")[0]: ax for ax in figure.axes if ax.get_title()}
     assert {ax.get_title() for ax in maps.values()} == {f"{name} (µm/s)" for name in maps}
-    assert set(maps) == {*PANELS, "change", "deviation"}
+    flows = {f"{name.capitalize()} flow": middle for name, middle in PANELS.items()}
+    change, wrong, uncertain = "Refined - assumed", "Refined - true", "Uncertainty, 1 σ"
+    assert set(maps) == {*flows, change, wrong, uncertain}
     crop = (slice(p.FIRST_ROW - 3, p.LAST_ROW + 4), slice(None))
     row, column = np.mgrid[: p.ROWS, : p.COLUMNS][:, *crop]
     fluid = FLUID[crop]
@@ -102,19 +104,20 @@ def test_the_maps_have_the_speed_of_each_pixel_in_um_per_second(data: ReportData
     def speed(middle: tuple[float, float]) -> np.ndarray:
         return np.hypot(middle[0] + 0.1 * (column - 30), middle[1] + 0.3 * (row - 14))
 
-    wanted = {name: speed(middle) for name, middle in PANELS.items()}
-    wanted["change"] = speed(p.REFINED_UM_S) - speed(p.ASSUMED_UM_S)  # refined is faster: positive
-    wanted["deviation"] = np.where(column < p.KNOWN_COLUMNS, 1.0, 10.0) * p.STD_LENGTH_UM_S
+    wanted = {name: speed(middle) for name, middle in flows.items()}
+    wanted[change] = speed(p.REFINED_UM_S) - speed(p.ASSUMED_UM_S)  # refined is faster: positive
+    wanted[wrong] = wanted["Refined flow"] - wanted["True flow"]
+    wanted[uncertain] = np.where(column < p.KNOWN_COLUMNS, 1.0, 10.0) * p.STD_LENGTH_UM_S
     for name, values in wanted.items():
         (shown,) = maps[name].images
         np.testing.assert_allclose(shown.get_array().filled(np.nan)[fluid], values[fluid], rtol=1e-5, err_msg=name)
         assert np.isnan(shown.get_array().filled(np.nan)[~fluid]).all()
-    (low, high) = maps["change"].images[0].get_clim()
+    (low, high) = maps[change].images[0].get_clim()
     assert low == -high < 0.0
 
 
 def test_the_part_of_the_map_that_is_not_known_is_hatched_and_no_other(data: ReportData) -> None:
-    (deviation,) = (panel for panel in _panels(data) if panel.title == "deviation")
+    (deviation,) = (panel for panel in _panels(data) if panel.title.startswith("uncertainty"))
     column = np.mgrid[: p.ROWS, : p.COLUMNS][1]
     np.testing.assert_array_equal(deviation.hatched, FLUID & (column >= p.KNOWN_COLUMNS))
     share = (p.COLUMNS - p.KNOWN_COLUMNS) / p.COLUMNS

@@ -23,7 +23,8 @@ def picture_in(shown: str) -> np.ndarray:
 def test_the_card_of_a_session_tells_how_it_ended_and_shows_the_image_in_its_middle() -> None:
     session = flowrec.open(GOLDEN)
     shown = session._repr_html_()
-    assert "golden.mcap" in shown and "reached" in shown and "bifurcation" in shown and len(shown) < 100_000
+    assert shown.index("<b>Reached") < shown.index("Flow error: assumed 12.7 %") < shown.index("golden.mcap")
+    assert "µm" in shown and " um" not in shown and "bifurcation" in shown and len(shown) < 100_000
     image = session.frames[len(session.frames) // 2].image
     assert picture_in(shown).shape == image.shape
     assert np.corrcoef(picture_in(shown).ravel(), image.ravel())[0, 1] > 0.99

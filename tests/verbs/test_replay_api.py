@@ -89,6 +89,10 @@ def test_a_replay_has_tables_and_its_temporary_file_goes_with_it() -> None:
     frame = done.before_after.to_pandas()
     assert frame.loc["commands_compared", "replayed"] == done.commands.compared
     assert list(frame.columns) == ["recorded", "replayed"]
+    assert len(repr(done)) < 200 and done.session.path.name in repr(done)
+    shown = done._repr_html_()
+    assert shown.startswith(f"<div><b>Replay of {done.session.path.name}: ") and done.covered.text in shown
+    assert done.before_after._repr_html_() in shown and " um" not in shown
     assert "planned" in str(done.before_after) or "route length" in str(done.before_after)
     del done, table
     gc.collect()

@@ -28,12 +28,14 @@ from flowrec.exports.report import style
 from flowrec.exports.report.curve_figures import RecordingFigure
 from flowrec.exports.report.curves import BUCKETS, CurveBuilder
 from flowrec.exports.report.explanations import MEANINGS, OUTCOMES
+from flowrec.exports.report.path_figure import PathFigure
 from flowrec.exports.report.report_data import ReportData
 from flowrec.exports.report.timeline_figure import TimelineFigure
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs import report_page as command
 from flowrec.verbs.cli import app
+from flowrec.view.colours import ColourScale, Table
 from tests.conftest import made_once
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
@@ -112,15 +114,46 @@ def test_the_page_needs_neither_network_nor_script_and_every_picture_says_what_i
 def test_the_page_states_outcome_numbers_with_units_refinement_and_provenance(html: str) -> None:
     text = " ".join(Parsed(html).text.split())
     for words in (
-        "Reached. The robot reached its goal.",
+        "Reached after 12.2 s. The robot reached its goal.",
         "refined flow error 8.9 %",
         "tracking error 53.7 µm",
-        "the robot moves 12 +- 2 % less per revolution than stated",
+        "the robot moves 12 ± 2 % less per revolution than stated",
+        "goal (5980, 2700) µm",
         "GOOD: consistent, unsigned; can be replayed",
         "by flowrec 0.1.0 (6421a40395)",
         "mean inward speed 220 µm/s",
     ):
         assert words in text
+    above = text[text.index("Reached after") : text.index("Path of the robot")]
+    assert all(words in above for words in ("to the goal in", "Flow error: assumed", "Learned from", "goal ("))
+    shown = text[: text.index("All settings")]  # those are as the file states them
+    assert "+-" not in shown and " um" not in shown
+
+
+@pytest.mark.parametrize("table", ["speed", "uncertainty", "change"])
+def test_a_map_has_the_colours_on_the_page_that_it_has_in_the_viewer(table: Table) -> None:
+    scale = ColourScale.up_to(437.0, table)
+    values = np.linspace(scale.low, scale.high, 256)
+    shown = style.colour_map(scale)((values - scale.low) / (scale.high - scale.low))[:, :3]
+    assert np.array_equal(np.rint(255.0 * shown), scale.paint(values))
+
+
+def test_image_and_path_lie_where_the_registration_that_was_found_puts_them() -> None:
+    data = ReportData.of(flowrec.open(MODERATE))
+    last, corner, found = data.history.last, np.array([[0.0, 0.0], [1.0, 2.0]]), []
+    assert last.refined is not None
+    for shift_um in (0.0, 100.0):
+        registration = np.array([[1.0, 0.0, shift_um], [0.0, 1.0, 0.0]])
+        data.history.last = replace(last, refined=replace(last.refined, registration=registration))
+        with style.drawing():
+            ax = PathFigure().draw(data, style.WIDE_MM).axes[0]
+        (path,) = (line for line in ax.lines if line.get_color() == style.VERMILLION)
+        image, _flow = ax.images
+        found.append((path.get_xydata(), (image.get_transform() - ax.transData).transform(corner)))
+    moved = data.scene.directions(np.array([data.scene.length_px(100.0), 0.0]))
+    for still, shifted in zip(*found, strict=True):
+        difference = (shifted - still)[np.isfinite(still[:, 0])]
+        assert len(difference) > 1 and difference == pytest.approx(np.tile(moved, (len(difference), 1)), abs=1e-6)
 
 
 def test_an_older_session_without_clocks_says_so_in_words() -> None:
@@ -181,7 +214,7 @@ def test_texts_of_a_session_are_escaped_and_shown_without_control_and_bidi_chara
     assert "(cut here; 1000" in page.text
     assert len(page.text) < 100_000
     assert not {"\x1b", "\u202e", "\u200f"} & set(html)
-    assert "The operator" in page.text and "Stopped." in page.text
+    assert "The operator" in page.text and "Stopped after" in page.text
 
 
 def test_a_session_that_lacks_parts_shows_no_empty_figure_and_says_why(tmp_path: Path) -> None:

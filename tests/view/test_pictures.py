@@ -12,10 +12,11 @@ import rerun as rr
 
 from flowrec.console.page_state import SHOWN, PageState
 from flowrec.core.enums import Outcome
-from flowrec.core.messages import FlowField, Shift
+from flowrec.core.messages import Applied, FlowField, Shift
 from flowrec.core.topics import Tick
 from flowrec.physics.chip.registration import Calibration
 from flowrec.physics.flow.sampling import sample
+from flowrec.stages.run_figures import figures_of
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.view import colours, flow_values, maps
 from flowrec.view.colours import ColourScale
@@ -299,3 +300,38 @@ def test_the_summary_says_by_how_much_the_picture_is_moved_in_the_middle_of_the_
     grown = 0.97 * np.eye(2)
     registration = np.column_stack((grown, middle + np.array([12.5, -4.0]) - grown @ middle))
     assert "(12.5, -4.0) um" in registration_remark(replace(refined, registration=registration))
+
+
+def test_where_nothing_is_commanded_the_field_is_that_of_the_log_of_the_coils(scene: Scene, ticks: list[Tick]) -> None:
+    mission, currents = ticks[-1].mission, ticks[-1].currents
+    assert mission is not None and currents is not None
+    applied = Applied(ticks[-1].stamp_ns, 12.5, 0.0, 3.0, np.zeros(3), np.zeros(2))
+    shown = []
+    for phase in ("navigate", "observe"):
+        record = Record()
+        logger = TickLogger(record, scene)  # type: ignore[arg-type]
+        logger.log(replace(ticks[-1], mission=replace(mission, phase=phase), applied=applied))
+        shown += record.logged["/coils/frequency"].scalars.as_arrow_array().to_pylist()
+    assert shown == [currents.frequency_hz, 12.5]
+
+
+def test_a_run_that_ends_in_its_survey_states_no_route_to_the_goal(scene: Scene, ticks: list[Tick]) -> None:
+    tick = ticks[-1]
+    assert tick.mission is not None and tick.route is not None
+    ended = replace(tick, mission=replace(tick.mission, phase="done", outcome="lost"))
+    assert "planned_s" in figures_of(scene.chip, ended, None, 0, None)
+    surveyed = replace(ended, route=replace(tick.route, method="survey"))
+    assert not {"planner", "planned_s", "route_length_um"} & set(figures_of(scene.chip, surveyed, None, 0, None))
+
+
+def test_a_map_that_comes_later_says_so_until_it_is_there(scene: Scene, ticks: list[Tick]) -> None:
+    field = ticks[-1].assumed
+    assert field is not None
+    record = Record()
+    logger = TickLogger(record, scene)  # type: ignore[arg-type]
+    logger.log(Tick(0))
+    assumed, refined = (f"/flow/{name}/not\\ yet" for name in ("assumed", "refined"))
+    assert record.logged[assumed].labels.as_arrow_array().to_pylist() == ["not computed yet"]
+    logger.log(Tick(1, assumed=field))
+    assert isinstance(record.logged[assumed], rr.Clear)
+    assert not isinstance(record.logged[refined], rr.Clear)

@@ -6,6 +6,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +20,8 @@ from flowrec.core.errors import SessionError
 from flowrec.core.messages import Health, OperatorEvent
 from flowrec.core.system.outputs import RRD, Output
 from flowrec.core.topics import Tick
+from flowrec.exports import rrd
+from flowrec.store.session import Session
 from flowrec.view.logger import TickLogger
 from flowrec.view.rrd_file import open_stream, write_rrd
 from flowrec.view.scene import Scene
@@ -46,12 +50,17 @@ class File:
                 whole = column.cast(pa.int64()) if pa.types.is_duration(column.type) else column
                 self.columns[chunk.entity_path][name] += whole.to_pylist()
         found: dict[str, dict[str, list[str]]] = defaultdict(dict)
+        self.time_axes: dict[str, str] = {}  # by the view
         for chunk in reader.stream(store=layout):
             batch = chunk.to_record_batch()
+            if "TimeAxis:view_range" in batch.schema.names:
+                self.time_axes[chunk.entity_path] = str(batch.column("TimeAxis:view_range").to_pylist()[-1])
             view = chunk.entity_path.removesuffix("/ViewContents")
             for name in batch.schema.names:
                 if name.startswith(("ViewBlueprint:", "ViewContents:query")):
                     found[view][name.split(":")[1]] = batch.column(name).to_pylist()[-1]
+        kinds = [view["class_identifier"][0] for view in found.values() if "class_identifier" in view]
+        self.over_time = sum(kind in ("TimeSeries", "StateTimeline") for kind in kinds)
         self.panels = [
             chunk.to_record_batch().column("TimePanelBlueprint:play_state").to_pylist()[-1]
             for chunk in reader.stream(store=layout)
@@ -210,6 +219,12 @@ def test_the_view_opens_at_the_start_and_plays(single: File) -> None:
     assert single.panels == [["Playing"]] or single.panels == [[2]]
 
 
+def test_all_plots_and_the_lanes_of_states_have_one_time_axis(single: File, double: File) -> None:
+    for file in (single, double):
+        assert len(file.time_axes) == file.over_time > 5
+        assert len(set(file.time_axes.values())) == 1
+
+
 def test_marks_alarms_and_losses_have_lanes_with_words_and_the_error_ends_with_the_mission(
     tmp_path: Path, scene: Scene, ticks: list[Tick]
 ) -> None:
@@ -241,10 +256,22 @@ def test_marks_alarms_and_losses_have_lanes_with_words_and_the_error_ends_with_t
     assert file.views[lanes] == ["/Mission", "/Observer", "/Operator", "/Recording", "/Robot"]
     assert states("/Mission") == ["Survey", "Refine", "Navigate", "Reached"]
     assert states("/Operator") == ["bubble <b>", ""]
-    assert states("/Observer") == ["inconsistent (NIS), flow pulsates", ""]
+    assert states("/Observer") == ["motion not explained, flow pulsates", ""]
     assert states("/Recording") == ["3 lost, every 2. kept"]
     stamps = [at for at in file.columns["/robot/tracking\\ error"]["session time"] if isinstance(at, int)]
     assert max(stamps) < ticks[60].stamp_ns <= max(file.columns["/camera/robot"]["session time"][1:])  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize(("outcome", "stated"), [("time over", "time over"), ("replayed", "")])
+def test_the_last_tick_of_a_run_that_was_stopped_states_the_outcome_of_its_file(
+    ticks: list[Tick], outcome: str, stated: str
+) -> None:
+    session = cast(Session, SimpleNamespace(outcome={"outcome": outcome}))
+    *before, last = rrd._with_end(session, ticks)
+    assert len(before) == len(ticks) - 1 and all(a is b for a, b in zip(before, ticks, strict=False))
+    assert last.mission is not None and last.estimate is ticks[-1].estimate
+    assert (last.mission.outcome, last.mission.finished) == (stated, bool(stated))
+    assert not stated or last.mission.since_ns == ticks[-1].stamp_ns
 
 
 def test_text_of_a_session_is_no_markdown_in_the_summary(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:

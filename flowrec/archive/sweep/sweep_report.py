@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from flowrec.archive.sweep.ranking import Ranking, settings_text
 from flowrec.archive.sweep.replay_process import Row
 from flowrec.archive.sweep.results import read_rows
-from flowrec.core import Output, UsageError, name_of, say, text_of_figure
+from flowrec.core import Output, UsageError, name_of, say, text_of_figure, with_micro
 from flowrec.verbs import HTML, require_packages
 
 if TYPE_CHECKING:
@@ -67,15 +67,26 @@ def _page(name: str, rows: Sequence[Row], ranking: Ranking) -> SweepPage:
         tables.append(ReportTable("Sessions by the verdict of flowrec check", counts, ("verdict", "sessions")))
     return SweepPage(
         name=name,
-        outcome=f"First: {ranking.rows[0].settings}." if ranking.figure else "No ranking.",
+        outcome=_outcome(ranking.figure, cells),
         good=not failed,
         note=ranking.note,
         about=f"{len(rows)} replays of {ranking.of_sessions} sessions, {len(failed)} failed; "
         f"by flowrec {', '.join(versions)}",
         figure=_figure(ranking),
-        ranking=ReportTable("Ranking", cells, columns, narrow_columns=3),
+        ranking=ReportTable("Ranking", [[*map(with_micro, row)] for row in cells], columns, narrow_columns=3),
         tables=tables,
     )
+
+
+def _outcome(figure: str, cells: Sequence[Sequence[str]]) -> str:
+    """The first of the ranking with its figure, and by how much the next one is behind it."""
+    if not figure:
+        return "No ranking."
+    (first, value, *_), *others = cells
+    text = f"First: {first}, {name_of(figure)} {value}."
+    for settings, _, more, interval, *_ in (each for each in others[:1] if each[2] != "-"):
+        text += f" Next: {settings}, {more} more" + (f" (95 %: {interval})." if interval != "-" else ".")
+    return with_micro(text)
 
 
 def _figure(ranking: Ranking) -> Any:
@@ -119,5 +130,5 @@ def _draw(ranking: Ranking, rows: Sequence[Any], width_mm: float) -> Any:
         )
     ax.set_yticks(range(len(rows)), [each.settings for each in rows])
     ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.set_xlabel(f"difference of the {name_of(ranking.figure)} ({unit})".replace("um", "µm"))
+    ax.set_xlabel(with_micro(f"difference of the {name_of(ranking.figure)} ({unit})"))
     return figure

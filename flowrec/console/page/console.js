@@ -149,7 +149,7 @@ function showDrawing(drawing) {
   );
   part("route").setAttribute("points", drawing.route.join(" "));
   part("goal").toggleAttribute("hidden", goal === null);
-  part("goal-um").textContent = drawing.goal_um === null ? "none" : `${drawing.goal_um.join(", ")} µm`;
+  part("goal-um").textContent = drawing.goal_um === null ? "none" : `(${drawing.goal_um.join(", ")}) µm`;
   place(part("asked"), null);
   if (goal !== null) {
     const [x, y] = goal;
@@ -229,8 +229,14 @@ async function showPicture(data) {
 
 function showEnd(how) {
   ended = true;
-  part("alert").textContent = `The run has ended: ${how.outcome}. ${how.files ? `Recorded in ${how.files}.` : ""}`;
+  const [first, ...others] = how.told.length ? how.told : [`The run has ended: ${how.outcome}`];
+  const told = [...others, ...(how.files ? [`Recorded in ${how.files}`] : [])];
+  part("alert").textContent = `${first}.`;
+  part("alert").append(...told.map((text) => Object.assign(document.createElement("span"), { textContent: `${text}.` })));
   part("alert").classList.toggle("good", how.good);
+  part("alert").classList.toggle("doubtful", how.doubtful);
+  part("state").textContent = how.outcome;
+  part("field").textContent = "off";
   part("alert").hidden = false;
   for (const button of document.querySelectorAll("aside button, aside input")) button.disabled = true;
   part("hint").textContent = "";

@@ -11,7 +11,7 @@ from flowrec.exports.report import style
 from flowrec.exports.report.curves import Curve
 from flowrec.exports.report.report_data import ReportData
 from flowrec.exports.report.time_axis import line, observation_points, panels, shown_observations
-from flowrec.physics import sample
+from flowrec.physics import on_chip, sample
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -150,7 +150,7 @@ class ObserverFigure:
             flow, on_map, true = (history.curve(f"{name}_{axis}_um_s") for name in ("flow", "map", "true"))
             width = std.mean if len(std.mean) == len(flow.mean) else np.full_like(flow.mean, np.nan)
             ax.fill_between(flow.time_s, flow.mean - width, flow.mean + width, color=style.SKY, alpha=0.35, lw=0.0)
-            line(ax, true, style.INK, "true (simulated)", lw=0.7)
+            line(ax, true, style.GREEN, "true (simulated)", lw=0.7)
             ax.plot(flow.time_s, flow.mean, color=style.BLUE, label="observer")
             line(ax, on_map, style.ORANGE, "map", lw=1.3)
             if observations is not None:
@@ -202,13 +202,14 @@ class PathFlowFigure:
         history = data.history
         figure, (ax,) = panels(history, width_mm, [44.0])
         path_um, time_s = data.path_um, history.curve("x_um").time_s
-        line(ax, _speed_of(data, "true"), style.INK, "true (simulated)", lw=0.7)
+        line(ax, _speed_of(data, "true"), style.GREEN, "true (simulated)", lw=0.7)
         if data.assumed is not None:
             speed = _speed(data.assumed, path_um)
             ax.plot(time_s, speed, color=style.QUIET, ls=(0, (4, 2)), label="assumed")
         top = 0.0
         if data.refined is not None:
-            speed, std = _speed(data.refined, path_um), _std(data.refined, path_um)
+            place_um = on_chip(data.refined.registration, path_um)
+            speed, std = _speed(data.refined, place_um), _std(data.refined, place_um)
             ax.fill_between(time_s, np.maximum(speed - std, 0.0), speed + std, color=style.ORANGE, alpha=0.3, lw=0.0)
             ax.plot(time_s, speed, color=style.ORANGE, lw=1.3, label="refined")
             top = float(np.nanmax(speed, initial=0.0))

@@ -49,7 +49,7 @@ def known_text(field: FlowField, mask: Bools, name: str) -> str:
     if field.std_um_s is None:
         return f"The method of the {name} map ({field.method}) states no standard deviation."
     share = float(not_known(field, mask).sum() / max(int(mask.sum()), 1))
-    text = f"Deviation: one standard deviation of the velocity that the {name} map states for itself."
+    text = f"Uncertainty: one standard deviation of the velocity that the {name} map states for itself."
     if share < 0.001:
         return f"{text} It is nowhere more than {NOT_KNOWN:.0%} of the typical speed."
     return f"{text} Hatched: where it is more than {NOT_KNOWN:.0%} of the typical speed ({share:.0%} of the fluid)."
@@ -72,14 +72,16 @@ class MapFigure:
         if refined is not None:
             parts.append(f"Refined: corrected by what the robot experienced (method {refined.method}).")
             if assumed is not None:
-                parts.append("Change: refined minus assumed speed.")
+                parts.append("Refined - assumed: the difference of the speeds.")
         else:
             parts.append("The flow was not refined in this session: there is no map after a refinement.")
         best = data.history.last.field
         assert best is not None
         parts.append(known_text(best, mask, "refined" if refined is not None else "assumed"))
         if data.truth is not None:
-            parts.append("True: the flow of the simulated world, which no stage of the run knew.")
+            parts.append(
+                "True: the flow of the simulated world, which no stage of the run knew; less it, the error of the map."
+            )
         return " ".join(parts)
 
     def alt(self, data: ReportData) -> str:
@@ -114,7 +116,7 @@ class ChangeFigure:
         assert before is not None and after is not None
         return (
             f"Recorded: the best map of the session (method {before.method}). Replayed: that of the replay "
-            f"(method {after.method}). Change: replayed minus recorded speed. "
+            f"(method {after.method}). Replayed - recorded: the difference of the speeds. "
             + known_text(after, data.scene.chip.mask, "replayed")
         )
 
@@ -130,20 +132,25 @@ class ChangeFigure:
 def _panels(data: ReportData) -> list[Panel]:
     mask, scale = data.scene.chip.mask, data.speed_scale()
     panels = _panels_of({"assumed": data.assumed, "refined": data.refined}, scale, mask)
-    return [*panels, Panel("true", speed(data.truth, mask), scale)] if data.truth is not None else panels
+    best = data.history.last.field
+    if data.truth is None or best is None:
+        return panels
+    name, error = "refined" if data.refined is not None else "assumed", change(best, data.truth, mask)
+    wrong = Panel(f"{name} - true", error, scale_of(error, "change"))
+    return [*panels, Panel("true flow", speed(data.truth, mask), scale), wrong]
 
 
 def _panels_of(named: Mapping[str, FlowField | None], scale: ColourScale, mask: Bools) -> list[Panel]:
     """The speed of one or two fields, their change, and the deviation that the last one states."""
     known = {name: field for name, field in named.items() if field is not None}
-    panels = [Panel(name, speed(field, mask), scale) for name, field in known.items()]
+    panels = [Panel(f"{name} flow", speed(field, mask), scale) for name, field in known.items()]
     fields = list(known.values())
     if len(fields) == 2:
         values = change(fields[1], fields[0], mask)
-        panels.append(Panel("change", values, scale_of(values, "change")))
+        panels.append(Panel(" - ".join(reversed(known)), values, scale_of(values, "change")))
     if fields and fields[-1].std_um_s is not None:
         values = uncertainty(fields[-1], mask)
-        panels.append(Panel("deviation", values, scale_of(values, "uncertainty"), not_known(fields[-1], mask)))
+        panels.append(Panel("uncertainty, 1 σ", values, scale_of(values, "uncertainty"), not_known(fields[-1], mask)))
     return panels
 
 
@@ -152,7 +159,8 @@ def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figur
     mask, um_per_px = data.scene.chip.mask, data.scene.chip.um_per_px
     box = tuple(slice(max(at.min() - _MARGIN_PX, 0), at.max() + _MARGIN_PX + 1) for at in np.nonzero(mask))
     height_px, width_px = mask[box].shape
-    columns = min(len(panels), 2 if width_mm > style.NARROW_MM else 1)
+    beside = 3 if len(panels) == 3 else 2  # no row is half empty
+    columns = min(len(panels), beside if width_mm > style.NARROW_MM else 1)
     rows = -(-len(panels) // columns)
     panel_mm = min((width_mm / columns - _BAR_MM) * height_px / width_px, _TALLEST_MM)
     figure = style.new_figure(width_mm, rows * (panel_mm + _TITLE_MM) + 4.0)
@@ -173,7 +181,7 @@ def _show(ax: Axes, panel: Panel, box: tuple[slice, ...]) -> AxesImage:
     ax.set_facecolor(style.SOLID)
     shown = ax.imshow(
         panel.values[box],
-        cmap=style.COLOUR_MAPS[panel.scale.table],
+        cmap=style.colour_map(panel.scale),
         vmin=panel.scale.low,
         vmax=panel.scale.high,
         interpolation="nearest",
@@ -182,5 +190,5 @@ def _show(ax: Axes, panel: Panel, box: tuple[slice, ...]) -> AxesImage:
         area = panel.hatched[box].astype(np.float64)
         ax.contourf(area, levels=[0.5, 1.5], colors="none", hatches=["//////"])
         ax.contour(area, levels=[0.5], colors=style.INK, linewidths=0.4)
-    ax.set_title(f"{panel.title} (µm/s)")
+    ax.set_title(f"{panel.title[:1].upper()}{panel.title[1:]} (µm/s)")
     return shown

@@ -89,17 +89,18 @@ class Page:
 
     name: str
     outcome: str
+    ended: str  # the outcome, and when
     good: bool
     sentence: str
     note: str
-    won: Sequence[str]  # what the run has won: the way and the flow
+    won: Sequence[str]  # the way, the flow, what the refinement learned
     doubts: Sequence[str]  # why it is doubtful
     about: str  # when, where, with what, in one line
     notes: Sequence[str]  # of people
     key_figures: ReportTable
     figures: dict[str, Drawn] = field(default_factory=dict)
     refined: bool = False
-    refinement: Sequence[str] = ()  # what it found
+    refinement: str = ""  # how both maps predict what was held back
     boundary: ReportTable | None = None
     events: Sequence[ReportTable] = ()
     recording: ReportTable | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from flowrec.core import Floats
 from flowrec.exports.report import style
 from flowrec.exports.report.report_data import ReportData
-from flowrec.view import Box, arrow_grid, flow_arrows, goal_of, length_text, round_below, speed, way_of
+from flowrec.view import Box, arrow_grid, flow_arrows, goal_of, length_text, place_on_chip, round_below, speed, way_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,20 +114,27 @@ def _background(ax: Axes, data: ReportData) -> None:
     scene, picture = data.scene, data.picture
     if picture is not None:
         height, width = (size * picture.step for size in picture.image.shape)
-        # Brightened: the path and the arrows are dark.
-        ax.imshow(picture.image, cmap="gray", vmin=-90, vmax=255, extent=(0.0, width, height, 0.0), zorder=0)
+        # Brightened: the path is dark.
+        shown = ax.imshow(picture.image, cmap="gray", vmin=-90, vmax=255, extent=(0.0, width, height, 0.0), zorder=0)
+        # As in the viewer, image and path lie where the registration that the refinement found puts them.
+        _place(shown, ax, scene.image_to_plane(replace(data.history.last, shift=None)))
     else:
         _on_mask(ax, data, np.where(scene.chip.mask, 255.0, 200.0), cmap="gray", vmin=0, vmax=255, zorder=0)
 
 
 def _on_mask(ax: Axes, data: ReportData, values: Floats, **how: Any) -> AxesImage:
     """Values (h, w) of the mask's pixels, where the camera sees them."""
-    from matplotlib.transforms import Affine2D
-
     height, width = values.shape
     shown = ax.imshow(values, extent=(0.0, width, height, 0.0), interpolation="nearest", **how)
-    shown.set_transform(Affine2D(np.vstack((data.scene.mask_to_plane(), (0.0, 0.0, 1.0)))) + ax.transData)
+    _place(shown, ax, data.scene.mask_to_plane())
     return shown
+
+
+def _place(shown: AxesImage, ax: Axes, to_plane: Floats) -> None:
+    """Move an image by (2, 3) into the picture plane."""
+    from matplotlib.transforms import Affine2D
+
+    shown.set_transform(Affine2D(np.vstack((to_plane, (0.0, 0.0, 1.0)))) + ax.transData)
 
 
 def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
@@ -137,7 +145,7 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
     scale = data.speed_scale()
     opacity = _OVER_PICTURE if data.picture is not None else 1.0
     values = speed(field, scene.chip.mask)
-    how = {"cmap": style.COLOUR_MAPS["speed"], "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
+    how = {"cmap": style.colour_map(scale), "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
     speeds = _on_mask(ax, data, values, **how)
     bar = figure.colorbar(speeds, ax=ax, shrink=0.85, aspect=22, pad=0.01, ticks=scale.ticks)
     bar.set_label("speed of the flow (µm/s)")
@@ -150,12 +158,13 @@ def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
             angles="xy",
             scale_units="xy",
             scale=1.0,
-            color=style.INK,
-            width=0.0018,
+            color="white",
+            edgecolor=style.INK,
+            lw=0.25,
+            width=0.0022,
             headwidth=4.5,
             headlength=5.0,
             headaxislength=4.0,
-            alpha=0.75,
             zorder=3,
         )
 
@@ -168,7 +177,7 @@ def _paths(ax: Axes, data: ReportData) -> None:
     if len(route):
         ax.plot(*route.T, lw=1.8, zorder=4, **white)
         ax.plot(*route.T, color=style.INK, lw=0.9, ls=(0, (4, 2)), zorder=5)
-    path = scene.to_plane(data.path_um)
+    path = scene.to_plane(place_on_chip(data.history.last, data.path_um))
     ax.plot(*path.T, lw=2.4, zorder=6, **white)
     ax.plot(*path.T, color=style.VERMILLION, lw=1.3, zorder=7)
     _directions(ax, path)
@@ -177,10 +186,10 @@ def _paths(ax: Axes, data: ReportData) -> None:
     goal_um = goal_of(data.history.last.mission)
     goal = None if goal_um is None else scene.to_plane(goal_um)
     at_goal = goal is not None and float(np.hypot(*(known[-1] - goal))) < _SAME_PLACE * radius_px
-    _place(ax, known[0], radius_px, "start", style.INK, below=goal is not None)
+    _mark(ax, known[0], radius_px, "start", style.INK, below=goal is not None)
     if goal is not None:
-        _place(ax, goal, 1.6 * radius_px, "goal", style.GREEN)
-    _place(ax, known[-1], radius_px, "" if at_goal else "end", style.VERMILLION)
+        _mark(ax, goal, 1.6 * radius_px, "goal", style.GREEN)
+    _mark(ax, known[-1], radius_px, "" if at_goal else "end", style.VERMILLION)
 
 
 def _directions(ax: Axes, path: Floats) -> None:
@@ -204,7 +213,7 @@ def _directions(ax: Axes, path: Floats) -> None:
         ax.annotate("", end, begin, arrowprops=arrow, zorder=8)
 
 
-def _place(ax: Axes, at: Floats, radius: float, name: str, colour: str, *, below: bool = False) -> None:
+def _mark(ax: Axes, at: Floats, radius: float, name: str, colour: str, *, below: bool = False) -> None:
     """A circle with a name, which stays within the axis."""
     from matplotlib.patches import Circle
 

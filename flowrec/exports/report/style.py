@@ -10,8 +10,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
 from xml.sax.saxutils import escape
 
+import numpy as np
+
+from flowrec.view import ColourScale
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
 MM_PER_UM = 1e-3
@@ -21,7 +26,6 @@ WIDTHS_MM = (NARROW_MM, WIDE_MM)
 INK, QUIET, FAINT, SOLID = "#222222", "#767676", "#dddddd", "#c8c8c8"
 # Distinguishable with colour blindness (Okabe and Ito 2008).
 ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7"
-COLOUR_MAPS = {"speed": "YlGnBu", "uncertainty": "Purples", "change": "PuOr"}  # by ColourScale.table
 PAGE_DPI, PAPER_DPI = 140, 300  # of images inside of a figure
 _RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with matplotlib
@@ -82,6 +86,13 @@ def new_figure(width_mm: float, height_mm: float, dpi: int = PAGE_DPI) -> Figure
     figure = Figure(figsize=size, layout="constrained", dpi=dpi)
     FigureCanvasAgg(figure)
     return figure
+
+
+def colour_map(scale: ColourScale) -> ListedColormap:
+    """The colours that a scale has in all pictures."""
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(scale.paint(np.linspace(scale.low, scale.high, 256)) / 255.0)
 
 
 def bare(ax: Axes) -> None:

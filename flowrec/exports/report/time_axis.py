@@ -6,28 +6,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flowrec.core import Floats, Observations, Phase
+from flowrec.core import Floats, Observations
 from flowrec.exports.report import style
 from flowrec.exports.report.curves import Curve
 from flowrec.exports.report.history import History
 from flowrec.exports.report.report_data import ReportData
+from flowrec.view import OF_PHASE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PHASE_COLOURS: dict[str, str] = {
-    Phase.START: "#d9d9d9",
-    Phase.SURVEY: "#cfe3f3",
-    Phase.REFINE: "#f6dfa4",
-    Phase.PLAN: "#f3c9a9",
-    Phase.NAVIGATE: "#c5e6da",
-    Phase.OBSERVE: "#cfe3f3",
-    Phase.DONE: "#e8e8e8",
-}
 _MOST_POINTS = 80  # observations in a figure: more would hide the curves
 _ORDINALS = {2: "2nd", 3: "3rd"}
 _MOST_LINES = 60  # begins of phases: more are in the strip only
+_TINT = 0.45  # strength of a phase's colour on paper
 _STRIP_MM = 4.0
 _LETTER_MM = 1.35  # width of a letter at the size of all figures
 _AXIS_MM = 14.0  # of the width, beside the panels: labels and numbers
@@ -60,11 +53,18 @@ def _draw_phases(ax: Axes, history: History, width_mm: float) -> None:
     per_s = (width_mm - _AXIS_MM) / (history.last_s - history.first_s)
     for span in history.phases.spans:
         length_s = span.to_s - span.from_s
-        ax.axvspan(span.from_s, span.to_s, color=PHASE_COLOURS.get(span.name, style.FAINT), lw=0.0)
+        ax.axvspan(span.from_s, span.to_s, color=_tint(span.name), lw=0.0)
         if per_s * length_s > _LETTER_MM * (len(span.name) + 1):
             ax.text(span.from_s + 0.5 * length_s, 0.45, span.name, ha="center", va="center")
     if not history.phases.spans:
         ax.text(0.0, 0.45, "no phases recorded", transform=ax.transAxes, va="center", color=style.QUIET)
+
+
+def _tint(phase: str) -> str | tuple[float, ...]:
+    """The colour that a phase has in all pictures, on white paper: light enough for its name."""
+    if phase not in OF_PHASE:
+        return style.FAINT
+    return tuple(1.0 - _TINT * (1.0 - level / 255.0) for level in OF_PHASE[phase])
 
 
 def line(ax: Axes, curve: Curve, colour: str, label: str, **how: object) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from flowrec.core import Action, Alarm, Level
+from flowrec.core import ALARM_WORDS, Action, Level
 from flowrec.exports.report import style
 from flowrec.exports.report.curves import Span
 from flowrec.exports.report.history import History, Remark
@@ -20,11 +20,6 @@ _LANE_MM = 5.0
 _BAR_HEIGHT = 0.55  # of a span, of its lane
 _LEAST_WIDTH = 0.004  # of the time axis: shorter spans are drawn this long
 _LABEL_MM = 6.0  # width of a number: moments that are nearer to each other share a label
-ALARMS: dict[str, str] = {
-    Alarm.NIS: "motion not explained",
-    Alarm.PULSATION: "flow pulsates",
-    Alarm.TRACKING: "robot often unseen",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +53,7 @@ class TimelineFigure:
         absent = [
             words
             for words, names in (
-                ("no alarm", ALARMS.values()),
+                ("no alarm", ALARM_WORDS.values()),
                 ("no mark or other action of the operator", ("operator",)),
                 ("no warning", ("warnings",)),
                 ("no time without the robot in view", ("robot not in view",)),
@@ -100,7 +95,10 @@ class TimelineFigure:
         lanes = [
             Lane("robot not in view", style.VERMILLION, history.unseen.spans),
             Lane("held by the operator", style.BLUE, history.held.spans),
-            *(Lane(ALARMS.get(name, name), style.ORANGE, each.spans) for name, each in sorted(history.alarms.items())),
+            *(
+                Lane(ALARM_WORDS.get(name, name), style.ORANGE, each.spans)
+                for name, each in sorted(history.alarms.items())
+            ),
             Lane("warnings", style.ORANGE, moments=warnings),
             Lane("operator", style.BLUE, moments=actions),
             Lane("no image", style.INK, self._gaps),

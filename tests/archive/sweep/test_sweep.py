@@ -324,7 +324,7 @@ def test_the_page_of_a_sweep_shows_the_ranking_and_what_has_failed(tmp_path: Pat
         results.put(row_of("c", refine="fvm") | {"error": "it <hangs>"})
     assert CliRunner().invoke(app, ["report", str(out)]).exit_code == 0
     html = out.with_name("out_report.html").read_text(encoding="utf-8")
-    assert "First: refine=&lt;gain&gt;." in html
+    assert "First: refine=&lt;gain&gt;, refined flow error 20.0 %. Next: refine=fvm, 7.5 % more (95 %: " in html
     assert "it &lt;hangs&gt;" in html and 'class="wide"' in html
     assert "<gain>" not in html
 
