@@ -151,7 +151,6 @@ def flow_text(figures: Mapping[str, Value]) -> str:
     told = f"flow{' error' if 'assumed_flow_error' in text else ''}: {', '.join(maps)}"
     if "stated_flow_error" in text:
         told += f"; the map states an error of {text['stated_flow_error']}"
-        told += f", from {text['observations']} observations" if "observations" in text else ""
     return told
 
 
