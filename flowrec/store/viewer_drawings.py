@@ -1,4 +1,4 @@
-"""Robot, route, goal and maps as messages of foxglove's schemas: as points in m on the chip, and on the camera's image.
+"""Robot, route, goal and maps as messages of foxglove's schemas: in mm on the chip, and in px on the camera's image.
 
 Rerun draws points and images, Foxglove draws all of it. Both flow previews use one colour scale, viridis from 0 to the
 highest speed of the first field; solid is black.
@@ -14,7 +14,7 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.core import M_PER_UM, Estimate, FlowField, Route, Track
+from flowrec.core import MM_PER_UM, Estimate, FlowField, Route, Track
 from flowrec.store.codec import Payload, byte_field_head
 from flowrec.store.viewer_scene import CHIP, MAP, STILL, Picture, ViewerScene, speed_um_s
 
@@ -42,7 +42,7 @@ def camera(picture: Picture, _scene: ViewerScene) -> Payload:
 
 
 def robot_pose(robot: Estimate | Track, scene: ViewerScene) -> Payload:
-    """Pose of the robot on the chip, in m."""
+    """Pose of the robot on the chip, in mm."""
     return _pose_field(*scene.place_um(robot.position_um)), _IN_CHIP
 
 
@@ -62,12 +62,12 @@ def robot_mark(robot: Estimate | Track, scene: ViewerScene) -> Payload:
 
 
 def path(route: Route, _scene: ViewerScene) -> Payload:
-    """The route as poses on the chip, in m."""
+    """The route as poses on the chip, in mm."""
     return (fg.PosesInFrame(frame_id=CHIP, poses=[_pose(x, y) for x, y in route.waypoints_um.tolist()]).encode(),)
 
 
 def path_points(route: Route, _scene: ViewerScene) -> Payload:
-    """The route as points on the chip, in m."""
+    """The route as points on the chip, in mm."""
     return (_cloud(route.waypoints_um, _PATH).encode(),)
 
 
@@ -127,8 +127,8 @@ def preview(field: FlowField, scene: ViewerScene) -> Payload:
 
 
 def grid(field: FlowField, _scene: ViewerScene) -> Payload:
-    """A flow in um/s on cells in m, with a relative precision of 2^-12: the topic of the field has all digits."""
-    (height, width), size_m = field.velocity_um_s.shape[:2], M_PER_UM * field.um_per_px
+    """A flow in um/s on cells in mm, with a relative precision of 2^-12: the topic of the field has all digits."""
+    (height, width), size_mm = field.velocity_um_s.shape[:2], MM_PER_UM * field.um_per_px
     values = np.empty((height, width, 3), "<f4")
     values[..., :2], values[..., 2] = field.velocity_um_s, speed_um_s(field)
     bits = values.view("<u4")
@@ -138,7 +138,7 @@ def grid(field: FlowField, _scene: ViewerScene) -> Payload:
         frame_id=CHIP,
         pose=_pose(-0.5 * field.um_per_px, -0.5 * field.um_per_px),  # the corner of pixel (0, 0)
         column_count=width,
-        cell_size=fg.Vector2(x=size_m, y=size_m),
+        cell_size=fg.Vector2(x=size_mm, y=size_mm),
         row_stride=values.strides[0],
         cell_stride=values.strides[1],
         fields=_float_fields("vx_um_s", "vy_um_s", "speed_um_s"),
@@ -148,7 +148,7 @@ def grid(field: FlowField, _scene: ViewerScene) -> Payload:
 
 
 def _pose(x_um: float, y_um: float) -> fg.Pose:
-    place = fg.Vector3(x=M_PER_UM * x_um, y=M_PER_UM * y_um, z=0.0)
+    place = fg.Vector3(x=MM_PER_UM * x_um, y=MM_PER_UM * y_um, z=0.0)
     return fg.Pose(position=place, orientation=STILL)
 
 
@@ -174,7 +174,7 @@ def _circle_points() -> NDArray[np.float64]:
 def _cloud(points_um: NDArray[np.float64], rgba: Rgba, *, placed: bool = True) -> fg.PointCloud:
     """Points (n, 2) on the chip; they are about a pose that follows where they are not `placed`."""
     points = np.zeros(len(points_um), [("at", "<f4", 3), ("colour", "u1", 4)])
-    points["at"][:, :2], points["colour"] = M_PER_UM * points_um, rgba
+    points["at"][:, :2], points["colour"] = MM_PER_UM * points_um, rgba
     colours = [
         fg.PackedElementField(name=name, offset=12 + place, type=fg.PackedElementFieldNumericType.Uint8)
         for place, name in enumerate(("red", "green", "blue", "alpha"))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.core import NS_PER_S, Estimate, FlowField, Message, Observations, Track
+from flowrec.core import NS_PER_S, Demand, Estimate, FlowField, Message, Observations, Track
 from flowrec.store import viewer_drawings as drawings
 from flowrec.store import viewer_numbers as numbers
 from flowrec.store.codec import Payload
@@ -20,7 +20,7 @@ from flowrec.store.schema import Schema, foxglove_schema
 from flowrec.store.viewer_scene import ViewerScene, drawable
 
 # The fields of Tick that viewer topics are made of.
-INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations"))
+INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations", "demand"))
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
 _NEVER = -(1 << 62)
 
@@ -58,6 +58,11 @@ class ViewerTopics:
         self._drawn: dict[str, tuple[object, ...]] = {"frames": (None, None), "goal": (None,)}  # what, by name
         self._robot_ns = _NEVER
 
+    def of_end(self, outcome: Mapping[str, str], stamp_ns: int) -> Iterator[tuple[str, int, Payload]]:
+        """As `of`, of the outcome of the run, when all of its messages are drawn; the stamp is that of its begin."""
+        for view in self._views.get("outcome", ()):
+            yield view.path, stamp_ns, view.make(outcome, self._scene)
+
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
         """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""
         # Numbers that can not be drawn are no error here.
@@ -94,6 +99,8 @@ class ViewerTopics:
             yield "marks", last_ns, last_ns
         if scene.route is not None and ("route" in messages or scene.field in messages.values()):
             yield "route on map", last_ns, scene.route
+        if isinstance(messages.get("demand"), Demand):
+            yield "demand", messages["demand"].stamp_ns, messages["demand"]
         observations = messages.get("observations")
         if isinstance(observations, Observations) and observations.position_um.shape[1:] == (2,):
             yield "observations", observations.stamp_ns, observations
@@ -131,6 +138,17 @@ VIEWER_TOPICS = (
     ViewerTopic("/view/flow_assumed", _IMAGE, "assumed", "assumed", drawings.preview),
     ViewerTopic("/view/flow_refined", _IMAGE, "refined", "refined", drawings.preview),
     ViewerTopic("/view/flow_refined_grid", _GRID, "refined", "refined", drawings.grid),
+    ViewerTopic("/verdict", numbers.TEXT, "outcome", "outcome of the run", numbers.verdict, False),
+    ViewerTopic("/view/flow_at_robot_um_s", numbers.NUMBER, "robot", "estimate", numbers.flow_speed, False),
+    ViewerTopic(
+        "/view/flow_difference_um_s",
+        numbers.NUMBER,
+        "robot",
+        "estimate, assumed, refined",
+        numbers.flow_difference,
+        False,
+    ),
+    ViewerTopic("/view/tracking_error_um", numbers.NUMBER, "demand", "demand", numbers.tracking_error, False),
     ViewerTopic("/view/robot_flow", numbers.ROBOT_FLOW, "robot", f"{_ROBOT}; assumed, refined", numbers.robot_flow),
     ViewerTopic("/view/observation", numbers.OBSERVATION, "observations", "observations", numbers.observation),
     ViewerTopic("/view/route_flow", numbers.ROUTE_FLOW, "route on map", "route, assumed, refined", numbers.route_flow),

@@ -1,6 +1,7 @@
 """Views for other programs."""
 
 import dataclasses
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,11 @@ START_NS = 1_790_000_000_000_000_000
 
 
 def parsed(path, payload):
-    return _SCHEMAS[path].wire.FromString(b"".join(payload))
+    """A message of protobuf, or the number or text of one of ROS 2."""
+    data = b"".join(payload)
+    if _SCHEMAS[path].wire is not None:
+        return _SCHEMAS[path].wire.FromString(data)
+    return struct.unpack_from("<d", data, 20)[0] if "Float64" in _SCHEMAS[path].name else data[8:-1].decode()
 
 
 def seen(views, messages):
@@ -40,7 +45,7 @@ def turned(q, vector):
 
 
 def projected(found, place, camera="/view/camera"):
-    """The pixel of a place in the chip's frame in m, by the transform and the calibration of a camera alone."""
+    """The pixel of a place in the chip's frame in mm, by the transform and the calibration of a camera alone."""
     calibration = found[camera]
     there = next(each for each in found["/view/frames"].transforms if each.child_frame_id == calibration.frame_id)
     assert there.parent_frame_id == "chip"
@@ -77,7 +82,7 @@ def test_robot_route_and_goal_lie_on_the_image_where_the_tracker_saw_them(angle_
         ring, (way, cross) = found["/view/robot_mark"].circles[0], found["/view/route_mark"].points
         pairs = [
             (robot_px, ring.position, found["/view/robot_pose"].pose.position),
-            (goal_px, found["/view/route_mark"].circles[0].position, [*(1e-6 * goal_um), 0.0]),
+            (goal_px, found["/view/route_mark"].circles[0].position, [*(1e-3 * goal_um), 0.0]),
             (way_px[0], way.points[0], found["/view/path"].poses[0].position),
             (way_px[1], way.points[-1], found["/view/path"].poses[-1].position),
         ]
@@ -90,9 +95,9 @@ def test_robot_route_and_goal_lie_on_the_image_where_the_tracker_saw_them(angle_
         assert np.isclose(ring.diameter * stated.um_per_px, 3.0 * 70.0, rtol=0.02) and len(cross.points) == 4
         assert ring.timestamp.ToNanoseconds() == way.timestamp.ToNanoseconds() == START_NS + now
         place = point(found["/view/robot_pose"].pose.position)
-        assert np.allclose(projected(found, place, "/view/map"), 1e6 * place[:2] / field.um_per_px + 0.5, atol=1e-3)
+        assert np.allclose(projected(found, place, "/view/map"), 1e3 * place[:2] / field.um_per_px + 0.5, atol=1e-3)
         (points,) = (found[f"/camera/frame/{name}"] for name in ("path",))
-        assert np.allclose(np.frombuffer(points.data, "<f4").reshape(-1, 4)[:, :2], 1e-6 * way_um, rtol=1e-6)
+        assert np.allclose(np.frombuffer(points.data, "<f4").reshape(-1, 4)[:, :2], 1e-3 * way_um, rtol=1e-6)
 
 
 def test_what_did_not_move_is_drawn_once_and_a_robot_out_of_sight_is_pale():
@@ -106,7 +111,8 @@ def test_what_did_not_move_is_drawn_once_and_a_robot_out_of_sight_is_pale():
     again = seen(
         views, {"track": replace(track, stamp_ns=late, seen=False), "mission": replace(mission, stamp_ns=late)}
     )
-    assert again.keys() == {"/view/robot_pose", "/camera/frame/robot", "/view/robot_mark", "/view/robot_flow"}
+    numbers = {"/view/robot_flow", "/view/flow_at_robot_um_s", "/view/flow_difference_um_s"}
+    assert again.keys() == {"/view/robot_pose", "/camera/frame/robot", "/view/robot_mark", *numbers}
     colours = [each["/view/robot_mark"].circles[0].outline_color for each in (first, again)]
     assert colours[0].b < colours[0].r == 1.0 and colours[1].r == colours[1].b
     gone = seen(views, {"mission": replace(mission, stamp_ns=late, goal_um=np.full(2, np.nan))})
@@ -127,6 +133,8 @@ def test_plotted_numbers_are_those_of_the_observer_and_of_the_map_where_the_robo
         assert (numbers.x_um, numbers.y_um, numbers.flow_um_s) == (30.0, 25.0, 5.0)
         assert np.isclose(numbers.map_um_s, np.hypot(*on_map), rtol=1e-6)
         assert np.isclose(numbers.difference_um_s, np.hypot(*(flow - on_map)), rtol=1e-6)
+    assert found["/view/flow_at_robot_um_s"] == 5.0
+    assert np.isclose(found["/view/flow_difference_um_s"], np.hypot(*(flow - on_map)), rtol=1e-12)
     assert (found["/view/robot_flow"].map_error_share, found["/view/observation"].std_um_s) == (0.25, 2.0)
     along = found["/view/route_flow"]
     there = sample(field, route.waypoints_um)
@@ -140,7 +148,7 @@ def test_the_robot_is_where_it_is_when_protobuf_reads_its_views():
         found = seen(ViewerTopics(), {"estimate": here})
         for path in ("/view/robot_pose", "/camera/frame/robot"):
             place = found[path].pose.position
-            assert np.allclose((place.x, place.y, place.z), (1e-6 * x_um, 1e-6 * y_um, 0.0), rtol=1e-12)
+            assert np.allclose((place.x, place.y, place.z), (1e-3 * x_um, 1e-3 * y_um, 0.0), rtol=1e-12)
             assert (found[path].pose.orientation.w, found[path].frame_id) == (1.0, "chip")
             assert found[path].timestamp.seconds * 10**9 + found[path].timestamp.nanos == stamp_ns
 
@@ -168,7 +176,7 @@ def in_file(path):
     with path.open("rb") as stream:
         reader = make_reader(stream)
         return [
-            (channel.topic, message.log_time, _SCHEMAS[channel.topic].wire.FromString(message.data))
+            (channel.topic, message.log_time, parsed(channel.topic, (message.data,)))
             for _, channel, message in reader.iter_messages()
             if channel.topic in _SCHEMAS
         ]
