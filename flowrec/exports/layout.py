@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flowrec.core import JSON, M_PER_UM, MM_PER_UM, RBL, Output
 from flowrec.store import LENGTHS, Session, SessionMetadata, files_behind
-from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, plot_of
+from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, peak, plot_of
 
 _CAMERA = "/view/camera"
 _LACKS = (
@@ -67,7 +67,9 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
         schemas = {channel.topic: head.schemas[channel.schema_id].name for channel in head.channels.values()}
     scale, px_um = MM_PER_UM if unit == "mm" else M_PER_UM, session.chip.um_per_px
     (width, height), (x, y) = ([scale * (um - less) for um in session.chip.size_um] for less in (0.0, px_um))
-    layout = foxglove_layout((0.5 * x, 0.5 * y), max(width, height), list(plots.values()), unit)
+    refined = session.fields.get("refined")
+    top_um_s = peak(refined) if refined is not None else None
+    layout = foxglove_layout((0.5 * x, 0.5 * y), max(width, height), list(plots.values()), unit, top_um_s)
     extra = [(schemas[path], plot) for path, plot in plots.items() if path in present]
     blueprint = bare_blueprint(present, began_ns + session.run.first_ns, began_ns + session.run.last_ns, extra)
     with foxglove.new_file() as part:

@@ -14,24 +14,32 @@ from flowrec.view.bare_plots import EVENTS, IMAGE, ON_IMAGE, PLOTS, ROUTE, STATE
 
 _COLOURS = ("#4e98e2", "#f5774d", "#f7df71")
 _MAP = "/view/flow_refined"
+_VIRIDIS = ("#440154ff", "#fde725ff")  # its ends: the colours of the other pictures
+# Of points. Without a mode and a field Foxglove colours them by x.
+_OWN_COLOURS = {"colorMode": "rgba-fields", "colorField": "red"}
 
 Panel = dict[str, Any]
 
 
 def foxglove_layout(
-    centre: tuple[float, float], size: float, extra: Sequence[Plot] = (), unit: str = "mm"
+    centre: tuple[float, float],
+    size: float,
+    extra: Sequence[Plot] = (),
+    unit: str = "mm",
+    top_um_s: float | None = None,
 ) -> dict[str, Any]:
     """The layout as JSON data, for a chip with this centre and longer side in a unit; `extra`: plots of extra topics.
 
-    `unit` is that of the lengths in the file's viewer topics, m in files of older flowrec.
+    `unit` is that of the lengths in the file's viewer topics, m in files of older flowrec; `top_um_s` the highest speed
+    of the refined flow, None without one.
     """
     panels: dict[str, Panel] = {
         "Image!camera": _image("Camera", IMAGE, "/view/camera"),
         "Image!map": _image("Refined flow", _MAP, "/view/map"),
-        "3D!chip": _chip(centre, size, unit),
+        "3D!chip": _chip(centre, size, unit, top_um_s),
         "Plot!route": _along_route(),
         "StateTransitions!states": _states(),
-        "RosOut!log": {"searchTerms": [], "minLogLevel": 1, "topicToRender": EVENTS[0]},
+        "RosOut!log": {"searchTerms": [], "preload": True, "minLogLevel": 1, "topicToRender": EVENTS[0]},
         "Tab!maps": _tab({"Refined flow": "Image!map", f"Chip ({unit})": "3D!chip"}),
     }
     groups = PLOTS | ({"extra": tuple(extra)} if extra else {})
@@ -63,14 +71,16 @@ def _image(title: str, topic: str, calibration: str) -> Panel:
             "annotations": {name: {"visible": in_pixels} for name in ("/view/route_mark", "/view/robot_mark")},
             "synchronize": False,
         },
-        "topics": {name: {"visible": not in_pixels, "pointSize": 3} for name in ON_IMAGE},
+        "topics": {name: {"visible": not in_pixels, "pointSize": 3, **_OWN_COLOURS} for name in ON_IMAGE},
         "followTf": "chip",
     }
 
 
-def _chip(centre: tuple[float, float], size: float, unit: str) -> Panel:
+def _chip(centre: tuple[float, float], size: float, unit: str, top_um_s: float | None) -> Panel:
     """Flow, route and robot on the chip, seen from where the camera is: x to the right, y down."""
-    grid = {"visible": True, "colorMode": "colormap", "colorMap": "turbo", "colorField": "speed_um_s"}
+    grid: Panel = {"visible": True, "colorMode": "gradient", "gradient": list(_VIRIDIS), "colorField": "speed_um_s"}
+    if top_um_s:
+        grid |= {"minValue": 0.0, "maxValue": top_um_s}  # by itself Foxglove takes 0 to 1
     return {
         "foxglovePanelTitle": f"Chip ({unit})",
         "cameraState": {
@@ -88,9 +98,9 @@ def _chip(centre: tuple[float, float], size: float, unit: str) -> Panel:
         },
         "followMode": "follow-none",
         "followTf": "chip",
-        "scene": {"transforms": {"showLabel": False, "axisScale": 0.0, "lineWidth": 0.0}},
+        "scene": {"transforms": {"showLabel": False, "axisSize": 0.0, "axisScale": 0.0, "lineWidth": 0.0}},
         "topics": {
-            **{name: {"visible": True, "pointSize": 4} for name in ON_IMAGE},
+            **{name: {"visible": True, "pointSize": 4, **_OWN_COLOURS} for name in ON_IMAGE},
             "/view/flow_refined_grid": grid,
             IMAGE: {"visible": False, "cameraInfoTopic": "/view/camera", "distance": HEIGHT[unit]},
         },

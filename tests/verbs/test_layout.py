@@ -74,6 +74,12 @@ def test_foxglove_gets_panels_topics_and_fields_that_exist_and_rerun_a_blueprint
     told = " ".join(made.advice)
     assert blueprint.application_id == "flowrec" and "--application-id flowrec" in told and str(rerun) in told
     assert layout["configById"]["Tab!maps"]["tabs"][1]["title"] == "Chip (mm)"
+    topics = layout["configById"]["3D!chip"]["topics"]
+    speed = np.hypot(*np.moveaxis(Session(session).fields["refined"].velocity_um_s, -1, 0))
+    assert topics["/view/flow_refined_grid"]["maxValue"] == speed.max()
+    assert topics["/view/flow_refined_grid"]["minValue"] == 0.0
+    # Where points name no field of theirs, the program colours them by x.
+    assert all(topics[name]["colorMode"] == "rgba-fields" and topics[name]["colorField"] == "red" for name in ON_IMAGE)
     chip = Session(session).chip
     target = layout["configById"]["3D!chip"]["cameraState"]["targetOffset"]
     assert np.allclose(target[:2], 5e-4 * (np.array(chip.size_um) - chip.um_per_px))
