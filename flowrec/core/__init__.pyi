@@ -5,7 +5,7 @@ from .clocks.clock_monitor import (
 from .clocks.device_clock import DeviceClock as DeviceClock, Fit as Fit, envelope as envelope
 from .config_tree import (
     IMAGE_SIZE as IMAGE_SIZE, Origin as Origin, REGISTRATION as REGISTRATION, apply_sets as apply_sets,
-    place_paths as place_paths, refuse_unknown as refuse_unknown, settings_of as settings_of,
+    nearest_settings as nearest_settings, place_paths as place_paths, refuse_unknown as refuse_unknown, settings_of as settings_of,
     take_registration as take_registration, type_error as type_error, without_none as without_none,
 )
 from .coverage import Coverage as Coverage
