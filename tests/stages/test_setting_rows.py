@@ -67,7 +67,7 @@ def test_a_misspelt_setting_is_answered_with_the_nearest() -> None:
     with pytest.raises(UsageError, match="did you mean mission"):
         settings("mision")
     # One of another section and a misspelt one: the same answer wherever it is given.
-    for wrong, right in (("refine.delay_s", "robot.delay_s"), ("plan.sped_share", "plan.speed_share")):
+    for wrong, right in (("recording.goal", "mission.goal"), ("plan.sped_share", "plan.speed_share")):
         with pytest.raises(UsageError) as used:
             load_config(None, [f"{wrong}=1"])
         with pytest.raises(UsageError) as asked:
