@@ -42,7 +42,7 @@ from .messages import (
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )
-from .messages.slow_stages import VALUES as VALUES, values_of as values_of
+from .messages.slow_stages import VALUES as VALUES, fluid_of as fluid_of, values_of as values_of
 from .methods import (
     ListedMethod as ListedMethod, Method as Method, Methods as Methods, OWN as OWN, REPLAYED as REPLAYED,
     table_at as table_at,

@@ -14,7 +14,7 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.core import MM_PER_UM, Estimate, FlowField, Route, Track
+from flowrec.core import MM_PER_UM, Estimate, FlowField, Route, Track, fluid_of
 from flowrec.store.codec import Payload, byte_field_head
 from flowrec.store.viewer_scene import CHIP, MAP, STILL, Picture, ViewerScene, speed_um_s
 
@@ -28,6 +28,7 @@ _ROUNDING = np.uint32(1 << 11)  # half of the last bit kept of a float's 23; the
 _NO_COLOUR = fg.Color(r=0.0, g=0.0, b=0.0, a=0.0)
 Rgba = tuple[int, int, int, int]
 _ROBOT, _UNSEEN, _PATH, _GOAL = (255, 112, 32, 255), (200, 200, 200, 255), (0, 216, 255, 255), (64, 255, 96, 255)
+_WALL, _WALL_POINTS = (130, 130, 130, 255), 4000  # points at most
 
 
 def transforms(stamp_ns: int, scene: ViewerScene) -> Payload:
@@ -114,6 +115,14 @@ def distance_um(points_um: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate((np.zeros(min(len(points_um), 1)), np.cumsum(steps)))
 
 
+def walls(field: FlowField, _scene: ViewerScene) -> Payload:
+    """The outline of the fluid as points on the chip: what Rerun's 3-D view takes its size from, before a route."""
+    outlines, _ = cv2.findContours(fluid_of(field).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    points_px = np.concatenate([np.zeros((0, 2)), *(outline[:, 0] for outline in outlines)])
+    every = -(-len(points_px) // _WALL_POINTS) or 1
+    return (_cloud(field.um_per_px * points_px[::every], _WALL).encode(),)
+
+
 def preview(field: FlowField, scene: ViewerScene) -> Payload:
     """The speed of a flow as an image."""
     speed = speed_um_s(field)
@@ -123,6 +132,18 @@ def preview(field: FlowField, scene: ViewerScene) -> Payload:
     colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
     colours[solid] = 0
     data = cv2.imencode(".png", colours)[1].tobytes()
+    return (fg.CompressedImage(frame_id=MAP, data=data, format="png").encode(),)
+
+
+def no_preview(scene: ViewerScene) -> Payload:
+    """An image for the time in which there is no refined flow yet, so that its view is not empty."""
+    assert scene.map is not None
+    picture, text = np.zeros((scene.map.height_px, scene.map.width_px), np.uint8), "no refined flow yet"
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
+    scale = 0.8 * scene.map.width_px / width
+    place = int(0.1 * scene.map.width_px), int(0.5 * (scene.map.height_px + scale * height))
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 160, 1, cv2.LINE_AA)
+    data = cv2.imencode(".png", picture)[1].tobytes()
     return (fg.CompressedImage(frame_id=MAP, data=data, format="png").encode(),)
 
 

@@ -6,6 +6,7 @@ image's topic, because Rerun's own layout of a file shows an image with all that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -57,17 +58,27 @@ class ViewerTopics:
         self._scene = ViewerScene() if scene is None else scene
         self._drawn: dict[str, tuple[object, ...]] = {"frames": (None, None), "goal": (None,)}  # what, by name
         self._robot_ns = _NEVER
+        self._calls = self._refined_at = 0  # calls of `of`; the first one with a refined flow
 
     def of_end(self, outcome: Mapping[str, str], stamp_ns: int) -> Iterator[tuple[str, int, Payload]]:
-        """As `of`, of the outcome of the run, when all of its messages are drawn; the stamp is that of its begin."""
+        """As `of`, of what is known when all messages are drawn; the stamp is that of the begin of the file.
+
+        The outcome of the run, and a picture in the place of the refined flow until there is one.
+        """
         for view in self._views.get("outcome", ()):
             yield view.path, stamp_ns, view.make(outcome, self._scene)
+        for view in self._views.get("refined", ()):
+            if self._refined_at > 1 and view.make is drawings.preview:
+                yield view.path, stamp_ns, (self._scene.stamp(stamp_ns), *drawings.no_preview(self._scene))
 
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
         """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""
         # Numbers that can not be drawn are no error here.
         with np.errstate(all="ignore"):
             self._scene.update(messages)
+            self._calls += 1
+            if "refined" in messages and not self._refined_at:
+                self._refined_at = self._calls
             for source, stamp_ns, made_of in list(self._inputs(messages)):
                 for view in self._views.get(source, ()):
                     payload = view.make(made_of, self._scene)
@@ -99,8 +110,11 @@ class ViewerTopics:
             yield "marks", last_ns, last_ns
         if scene.route is not None and ("route" in messages or scene.field in messages.values()):
             yield "route on map", last_ns, scene.route
-        if isinstance(messages.get("demand"), Demand):
-            yield "demand", messages["demand"].stamp_ns, messages["demand"]
+        demand = messages.get("demand")
+        # NaN is a gap in the line; before the first number it would be a plot without a line.
+        if isinstance(demand, Demand) and ("error" in self._drawn or math.isfinite(demand.error_um)):
+            self._drawn["error"] = ()
+            yield "demand", demand.stamp_ns, demand
         observations = messages.get("observations")
         if isinstance(observations, Observations) and observations.position_um.shape[1:] == (2,):
             yield "observations", observations.stamp_ns, observations
@@ -135,6 +149,7 @@ VIEWER_TOPICS = (
     ViewerTopic("/camera/frame/goal", _POINTS, "goal", "mission", drawings.goal_points),
     ViewerTopic("/view/robot_mark", _MARKS, "robot on picture", _ROBOT, drawings.robot_mark, False),
     ViewerTopic("/view/route_mark", _MARKS, "marks", "route, mission, refined", drawings.route_mark, False),
+    ViewerTopic("/view/walls", _POINTS, "assumed", "assumed", drawings.walls),
     ViewerTopic("/view/flow_assumed", _IMAGE, "assumed", "assumed", drawings.preview),
     ViewerTopic("/view/flow_refined", _IMAGE, "refined", "refined", drawings.preview),
     ViewerTopic("/view/flow_refined_grid", _GRID, "refined", "refined", drawings.grid),

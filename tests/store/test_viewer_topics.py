@@ -1,15 +1,17 @@
 """Views for other programs."""
 
 import dataclasses
+import math
 import struct
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from flowrec.core.declarations import as_read
-from flowrec.core.messages import Estimate, Mission, Observations, Route, Track
+from flowrec.core.messages import Demand, Estimate, Mission, Observations, Route, Track
 from flowrec.physics.chip.registration import Calibration, on_chip
 from flowrec.physics.flow.sampling import sample
 from flowrec.store.roi import nonzero_window, region_from
@@ -140,6 +142,34 @@ def test_plotted_numbers_are_those_of_the_observer_and_of_the_map_where_the_robo
     there = sample(field, route.waypoints_um)
     assert list(along.distance_um) == [0.0, 20.0] and list(along.std_um_s) == [3.0, 3.0]
     assert np.allclose(along.along_um_s, there[:, 1], rtol=1e-6) and np.allclose(along.map_um_s, np.hypot(*there.T))
+
+
+def at_the_end(views):
+    return {path: payload for path, _, payload in views.of_end({"outcome": "reached"}, 7)}
+
+
+def test_rerun_gets_no_view_that_stays_empty():
+    fluid = np.zeros((24, 32), "<f4")
+    fluid[5:9, 3:30] = 1.0  # rows 5 to 8, columns 3 to 29
+    flow = dataclasses.replace(field_of(1, np.random.default_rng(2)), wall_px=fluid)
+    demand = Demand(5, np.zeros(2), np.zeros(2), 0.0, math.nan, False, np.zeros((0, 2)))
+    views = ViewerTopics()
+    first = seen(views, {"assumed": flow, "demand": demand})
+    points = np.frombuffer(first["/view/walls"].data, "<f4").reshape(-1, 4)[:, :2]
+    edges = [(3, 5), (29, 8)] * np.array(1e-3 * flow.um_per_px)
+    assert np.allclose((points.min(axis=0), points.max(axis=0)), edges, rtol=1e-6) and len(points) == 2 * (26 + 3)
+    assert "/view/tracking_error_um" not in first, "a line of NaN"
+    found = [seen(views, {"demand": replace(demand, error_um=error)}) for error in (3.0, math.nan)]
+    assert found[0]["/view/tracking_error_um"] == 3.0 and math.isnan(found[1]["/view/tracking_error_um"])
+    assert at_the_end(views).keys() == {"/verdict"}, "never refined: no view of it"
+    assert list(views.of({"refined": flow}))
+    later = at_the_end(views)
+    assert later.keys() == {"/verdict", "/view/flow_refined"}
+    message = parsed("/view/flow_refined", later["/view/flow_refined"])
+    picture = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture.shape == (24, 32) and picture.any() and message.frame_id == "map"
+    at_once = ViewerTopics()
+    assert list(at_once.of({"refined": flow})) and at_the_end(at_once).keys() == {"/verdict"}
 
 
 def test_the_robot_is_where_it_is_when_protobuf_reads_its_views():
