@@ -48,4 +48,5 @@ from .traffic import (
     TIMEOUT_KEY as TIMEOUT_KEY, TRAFFIC as TRAFFIC, TransientError as TransientError,
 )
 from .viewer_scene import HEIGHT as HEIGHT, LENGTHS as LENGTHS
+from .viewer_topics import VERDICT as VERDICT
 from .writer import SessionWriter as SessionWriter

@@ -123,28 +123,34 @@ def walls(field: FlowField, _scene: ViewerScene) -> Payload:
     return (_cloud(field.um_per_px * points_px[::every], _WALL).encode(),)
 
 
-def preview(field: FlowField, scene: ViewerScene) -> Payload:
-    """The speed of a flow as an image."""
+def preview(field: FlowField | None, scene: ViewerScene) -> Payload:
+    """The speed of a flow as an image; without one an image that says so, because its view would be empty."""
+    if field is None:
+        return _image(_no_flow(scene))
     speed = speed_um_s(field)
     solid = speed == 0.0
     speed *= 255.0 / (scene.top_um_s or 1.0)
     grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
     colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
     colours[solid] = 0
-    data = cv2.imencode(".png", colours)[1].tobytes()
+    return _image(colours)
+
+
+def _image(pixels: NDArray[Any]) -> Payload:
+    data = cv2.imencode(".png", pixels)[1].tobytes()
     return (fg.CompressedImage(frame_id=MAP, data=data, format="png").encode(),)
 
 
-def no_preview(scene: ViewerScene) -> Payload:
-    """An image for the time in which there is no refined flow yet, so that its view is not empty."""
-    assert scene.map is not None
-    picture, text = np.zeros((scene.map.height_px, scene.map.width_px), np.uint8), "no refined flow yet"
+def _no_flow(scene: ViewerScene) -> NDArray[np.uint8]:
+    """(h, w) grey levels of the size of the map."""
+    assert scene.field is not None
+    (h, w), text = scene.field.velocity_um_s.shape[:2], "no refined flow"
+    picture: NDArray[np.uint8] = np.zeros((h, w), np.uint8)
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
-    scale = 0.8 * scene.map.width_px / width
-    place = int(0.1 * scene.map.width_px), int(0.5 * (scene.map.height_px + scale * height))
+    scale = 0.8 * w / width
+    place = int(0.1 * w), int(0.5 * (h + scale * height))
     cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 160, 1, cv2.LINE_AA)
-    data = cv2.imencode(".png", picture)[1].tobytes()
-    return (fg.CompressedImage(frame_id=MAP, data=data, format="png").encode(),)
+    return picture
 
 
 def grid(field: FlowField, _scene: ViewerScene) -> Payload:

@@ -155,6 +155,7 @@ class ViewerScene:
     camera : of the session; None if its settings are not known.
     start_unix_ns : Unix time of stamp 0.
     top_um_s : speed at the bright end of the colour scale; None before the first flow field.
+    refined : the refined flow; None before there is one.
     field : the best flow known: refined where there is one, else assumed.
     route, goal_um : the latest; None without one.
     picture, map : the camera's image and the pixels of the flow on the chip; None where they are not known.
@@ -164,12 +165,12 @@ class ViewerScene:
         self.camera = camera
         self.start_unix_ns = start_unix_ns
         self.top_um_s: float | None = None
+        self.refined: FlowField | None = None
         self.field: FlowField | None = None
         self.route: Route | None = None
         self.goal_um: NDArray[np.float64] | None = None
         self.picture = camera.picture(None) if camera is not None else None
         self.map: Picture | None = None
-        self._refined: FlowField | None = None
         self._shift: Shift | None = None
 
     @property
@@ -186,9 +187,9 @@ class ViewerScene:
     def place_um(self, measured_um: NDArray[np.float64]) -> tuple[float, float]:
         """Place on the chip of one measured place (2,), quicker than `on_chip` of flowrec.physics."""
         x, y = measured_um.tolist()
-        if self._refined is None or self._refined.registration is None:
+        if self.refined is None or self.refined.registration is None:
             return x, y
-        (xx, xy, x0), (yx, yy, y0) = self._refined.registration.tolist()
+        (xx, xy, x0), (yx, yy, y0) = self.refined.registration.tolist()
         return xx * x + xy * y + x0, yx * x + yy * y + y0
 
     def update(self, messages: Mapping[str, Message]) -> None:
@@ -199,14 +200,14 @@ class ViewerScene:
                 if self.top_um_s is None:
                     self.top_um_s = float(speed_um_s(field).max()) or 1.0
                 if name == "refined":
-                    self._refined = field
-                if name == "refined" or self._refined is None:
+                    self.refined = field
+                if name == "refined" or self.refined is None:
                     self.field = field
                 self.map = _map(field) or self.map
         shift, route, mission = (messages.get(name) for name in ("shift", "route", "mission"))
         if isinstance(shift, Shift):
             self._shift = shift
-        refined = self._refined
+        refined = self.refined
         moved = isinstance(shift, Shift) or (refined is not None and refined is messages.get("refined"))
         if moved and self.camera is not None:
             self.picture = self.camera.picture(None if refined is None else refined.registration, self._shift)

@@ -24,6 +24,7 @@ from flowrec.store.viewer_scene import ViewerScene, drawable
 INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations", "demand"))
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
 _NEVER = -(1 << 62)
+VERDICT = "/verdict"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,27 +59,17 @@ class ViewerTopics:
         self._scene = ViewerScene() if scene is None else scene
         self._drawn: dict[str, tuple[object, ...]] = {"frames": (None, None), "goal": (None,)}  # what, by name
         self._robot_ns = _NEVER
-        self._calls = self._refined_at = 0  # calls of `of`; the first one with a refined flow
 
     def of_end(self, outcome: Mapping[str, str], stamp_ns: int) -> Iterator[tuple[str, int, Payload]]:
-        """As `of`, of what is known when all messages are drawn; the stamp is that of the begin of the file.
-
-        The outcome of the run, and a picture in the place of the refined flow until there is one.
-        """
+        """As `of`, of the outcome of the run, when all of its messages are drawn; the stamp is that of its begin."""
         for view in self._views.get("outcome", ()):
             yield view.path, stamp_ns, view.make(outcome, self._scene)
-        for view in self._views.get("refined", ()):
-            if self._refined_at > 1 and view.make is drawings.preview:
-                yield view.path, stamp_ns, (self._scene.stamp(stamp_ns), *drawings.no_preview(self._scene))
 
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
         """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""
         # Numbers that can not be drawn are no error here.
         with np.errstate(all="ignore"):
             self._scene.update(messages)
-            self._calls += 1
-            if "refined" in messages and not self._refined_at:
-                self._refined_at = self._calls
             for source, stamp_ns, made_of in list(self._inputs(messages)):
                 for view in self._views.get(source, ()):
                     payload = view.make(made_of, self._scene)
@@ -122,6 +113,10 @@ class ViewerTopics:
             field = messages.get(name)
             if isinstance(field, FlowField) and drawable(field):
                 yield name, field.stamp_ns, field
+                if name == "refined":
+                    yield "refined picture", field.stamp_ns, field
+                elif scene.refined is None and self._is_new("no refined flow", True):
+                    yield "refined picture", field.stamp_ns, None
 
     def _is_new(self, name: str, *made_of: object) -> bool:
         """True if a drawing was last made of something else; then it is noted as made of this."""
@@ -151,9 +146,9 @@ VIEWER_TOPICS = (
     ViewerTopic("/view/route_mark", _MARKS, "marks", "route, mission, refined", drawings.route_mark, False),
     ViewerTopic("/view/walls", _POINTS, "assumed", "assumed", drawings.walls),
     ViewerTopic("/view/flow_assumed", _IMAGE, "assumed", "assumed", drawings.preview),
-    ViewerTopic("/view/flow_refined", _IMAGE, "refined", "refined", drawings.preview),
+    ViewerTopic("/view/flow_refined", _IMAGE, "refined picture", "refined", drawings.preview),
     ViewerTopic("/view/flow_refined_grid", _GRID, "refined", "refined", drawings.grid),
-    ViewerTopic("/verdict", numbers.TEXT, "outcome", "outcome of the run", numbers.verdict, False),
+    ViewerTopic(VERDICT, numbers.TEXT, "outcome", "outcome of the run", numbers.verdict, False),
     ViewerTopic("/view/flow_at_robot_um_s", numbers.NUMBER, "robot", "estimate", numbers.flow_speed, False),
     ViewerTopic(
         "/view/flow_difference_um_s",
