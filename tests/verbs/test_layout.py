@@ -71,6 +71,9 @@ def test_foxglove_gets_panels_topics_and_fields_that_exist_and_rerun_a_blueprint
         named
     )
     (blueprint,) = RrdReader(rerun).blueprints()
+    chunks = [each.to_record_batch().to_pydict() for each in RrdReader(rerun).stream(store=blueprint).to_chunks()]
+    origins = {each["ViewBlueprint:space_origin"][0][0] for each in chunks if "ViewBlueprint:space_origin" in each}
+    assert {"/verdict", IMAGE, *MAPS} <= origins <= SLOTS.keys() | {"/"}
     told = " ".join(made.advice)
     assert blueprint.application_id == "flowrec" and "--application-id flowrec" in told and str(rerun) in told
     assert layout["configById"]["Tab!maps"]["tabs"][1]["title"] == "Chip (mm)"
