@@ -8,10 +8,11 @@ import os
 import pickle
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
+from unittest import mock
 
 import pytest
 from hypothesis import settings
@@ -21,6 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from flowrec.core.system.numba_setup import _cache_folder
 from flowrec.stages.config import load_config
+from flowrec.verbs.cli import main
 from flowrec.verbs.record import record
 from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
@@ -124,6 +126,13 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 @pytest.fixture(scope="session")
 def session(mission: Recorded) -> Path:
     return mission.path
+
+
+def run(words: Iterable[object]) -> int:
+    """Exit status of `flowrec` with these words in this process, because to start another one takes longer."""
+    with mock.patch("sys.argv", ["flowrec", *map(str, words)]), pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
 
 
 def until(happened: Callable[[], object], told: Callable[[], str] = lambda: "waited in vain") -> None:

@@ -77,7 +77,7 @@ def rewrite(
         for declared in (*summary.schemas.values(), *summary.channels.values()):
             edit_head(declared)
         schemas = {n: writer.register_schema(s.name, s.encoding, s.data) for n, s in summary.schemas.items()}
-        parsers = {n: parser_of(s) for n, s in summary.schemas.items()}
+        parsers = {n: parser_of(s) if s.encoding == "protobuf" else None for n, s in summary.schemas.items()}
         channels = {
             n: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
             for n, c in summary.channels.items()
@@ -90,7 +90,8 @@ def rewrite(
                 continue
             data = message.data
             if edit is not None:
-                wire = parsers[channel.schema_id].FromString(data)
+                parser = parsers[channel.schema_id]
+                wire = parser.FromString(data) if parser is not None else None
                 if edit(channel, message, wire):
                     edited += 1
                     data = wire.SerializeToString(deterministic=True)
@@ -214,7 +215,7 @@ def edit_of_declaration(what: str) -> EditHead:
 EDITS: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
     **{
         f"a value of {path}": (lambda path=path: {"edit": edit_of_value(path)}, path)
-        for path in (*(topic.path for topic in TOPICS), *(view.path for view in VIEWER_TOPICS))
+        for path in (*(topic.path for topic in TOPICS), *(view.path for view in VIEWER_TOPICS if view.schema.wire))
     },
     **{
         f"{name} of the head": (lambda name=name: {"edit_head": edit_of_head(name, operator="somebody else")}, part)

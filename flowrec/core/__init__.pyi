@@ -5,7 +5,7 @@ from .clocks.clock_monitor import (
 from .clocks.device_clock import DeviceClock as DeviceClock, Fit as Fit, envelope as envelope
 from .config_tree import (
     IMAGE_SIZE as IMAGE_SIZE, Origin as Origin, REGISTRATION as REGISTRATION, apply_sets as apply_sets,
-    place_paths as place_paths, refuse_unknown as refuse_unknown, settings_of as settings_of,
+    nearest_settings as nearest_settings, place_paths as place_paths, refuse_unknown as refuse_unknown, settings_of as settings_of,
     take_registration as take_registration, type_error as type_error, without_none as without_none,
 )
 from .coverage import Coverage as Coverage
@@ -42,7 +42,7 @@ from .messages import (
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )
-from .messages.slow_stages import VALUES as VALUES, values_of as values_of
+from .messages.slow_stages import VALUES as VALUES, fluid_of as fluid_of, values_of as values_of
 from .methods import (
     ListedMethod as ListedMethod, Method as Method, Methods as Methods, OWN as OWN, REPLAYED as REPLAYED,
     table_at as table_at,
@@ -113,7 +113,7 @@ from .topics import (
     Extra as Extra, NO_EXTRA as NO_EXTRA, TOPICS as TOPICS, Tick as Tick, WORKER_FIELDS as WORKER_FIELDS, stale_results as stale_results,
 )
 from .units import (
-    M_PER_UM as M_PER_UM, NS_PER_S as NS_PER_S, PA_S_PER_MPA_S as PA_S_PER_MPA_S, UM_PER_M as UM_PER_M,
+    M_PER_UM as M_PER_UM, MM_PER_UM as MM_PER_UM, NS_PER_S as NS_PER_S, PA_S_PER_MPA_S as PA_S_PER_MPA_S, UM_PER_M as UM_PER_M,
     amounts as amounts, nanoseconds as nanoseconds, seconds as seconds, unit_of as unit_of,
     unit_suffix as unit_suffix, wrap_rad as wrap_rad,
 )

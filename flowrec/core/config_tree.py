@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -195,9 +195,7 @@ def refuse_unknown(
     for key, value in tree.items():
         name = prefix + key
         if key not in known:
-            keys = [each for each, _ in _all_hints(root)]
-            near = [each for each in keys if each.rpartition(".")[2] == key] if section is None else []
-            near = near[:3] or difflib.get_close_matches(name, keys, n=1, cutoff=0.6)
+            near = nearest_settings(name, [each for each, _ in _all_hints(root)])
             all_of = (
                 f"known here: {', '.join(prefix + each for each in known)}" if prefix else "flowrec settings lists all"
             )
@@ -208,6 +206,12 @@ def refuse_unknown(
             if not isinstance(value, dict):
                 raise UsageError(f"{origin(name)}: {name} is a section, not a value; set one of its keys")
             refuse_unknown(value, root, origin, inner, f"{name}.")
+
+
+def nearest_settings(name: str, keys: Sequence[str]) -> list[str]:
+    """The keys that a wrong one may mean: up to three with the same last part, else the one that is most alike."""
+    same = [key for key in keys if key.rpartition(".")[2] == name.rpartition(".")[2]]
+    return same[:3] or difflib.get_close_matches(name, keys, 1, 0.6)
 
 
 def _all_hints(section: type, prefix: str = "") -> Iterable[tuple[str, Any]]:

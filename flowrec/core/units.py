@@ -8,6 +8,7 @@ import re
 
 NS_PER_S = 1_000_000_000
 M_PER_UM = 1e-6
+MM_PER_UM = 1e-3
 UM_PER_M = 1e6
 PA_S_PER_MPA_S = 1e-3
 # Units on the command line.

@@ -7,9 +7,9 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowrec.core import JSON, M_PER_UM, RBL, Output
-from flowrec.store import Session, SessionMetadata, files_behind
-from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, plot_of
+from flowrec.core import JSON, M_PER_UM, MM_PER_UM, RBL, Output
+from flowrec.store import LENGTHS, Session, SessionMetadata, files_behind
+from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, peak, plot_of
 
 _CAMERA = "/view/camera"
 _LACKS = (
@@ -55,18 +55,21 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
     )
     foxglove.check()
     rerun.check()
-    (width_m, height_m), px_m = (M_PER_UM * um for um in session.chip.size_um), M_PER_UM * session.chip.um_per_px
     plots = {
         topic.path: plot
         for topic in session.reader.topics.extra
         if (plot := plot_of(topic, next(session.messages(topic.path), None))) is not None
     }
-    centre_m = 0.5 * (width_m - px_m), 0.5 * (height_m - px_m)
-    layout = foxglove_layout(centre_m, max(width_m, height_m), list(plots.values()))
     with SessionMetadata(session.run.files[0].path) as head:
         counts, began_ns = head.statistics.channel_message_counts, head.source.start_unix_ns
         present = {head.channels[number].topic for number, count in counts.items() if count}
+        unit = next((each.metadata[LENGTHS] for each in head.channels.values() if LENGTHS in each.metadata), "m")
         schemas = {channel.topic: head.schemas[channel.schema_id].name for channel in head.channels.values()}
+    scale, px_um = MM_PER_UM if unit == "mm" else M_PER_UM, session.chip.um_per_px
+    (width, height), (x, y) = ([scale * (um - less) for um in session.chip.size_um] for less in (0.0, px_um))
+    refined = session.fields.get("refined")
+    top_um_s = peak(refined) if refined is not None else None
+    layout = foxglove_layout((0.5 * x, 0.5 * y), max(width, height), list(plots.values()), unit, top_um_s)
     extra = [(schemas[path], plot) for path, plot in plots.items() if path in present]
     blueprint = bare_blueprint(present, began_ns + session.run.first_ns, began_ns + session.run.last_ns, extra)
     with foxglove.new_file() as part:

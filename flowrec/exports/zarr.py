@@ -1,6 +1,7 @@
 """The export format zarr: images and flow fields in chunks, for xarray, napari and Dask.
 
-The images are the array `frames` of the root group, dimensions time, y_px, x_px; each flow field is a group with the
+The images are the array `frames` of the root group, dimensions time, y_px, x_px, with the places of their pixels on the
+chip as x_um and y_um, by the calibration as stated. Each flow field, the last one of its kind, is a group with the
 dimensions y_um, x_um, component. `xarray.open_zarr(folder)` opens the images, with `group="refined"` a field.
 Format 2 of Zarr, which every reader takes, and which has texts, as the names of the components, and consolidated
 metadata; format 3 specifies neither yet. https://zarr-specs.readthedocs.io/en/latest/v2/v2.0.html
@@ -8,6 +9,7 @@ metadata; format 3 specifies neither yet. https://zarr-specs.readthedocs.io/en/l
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -56,12 +58,14 @@ class ZarrExport:
 def _write_frames(root: zarr.Group, session: Session, progress: TimeProgress) -> None:
     frames, start_unix_ns = session.frames, session.header.start_unix_ns
     stamps_ns = frames.stamps_ns
-    coordinates: dict[str, tuple[Any, dict[str, Any]]] = {
-        column.name: (values, {"description": column.meaning} | ({"unit": column.unit} if column.unit else {}))
-        for column, values in zip(columns_of("frame")[:2], (stamps_ns, stamps_ns / 1e9), strict=True)
+    coordinates: dict[str, tuple[Sequence[str], Any, dict[str, Any]]] = {
+        column.name: (["time"], values, {"description": column.meaning, "units": column.unit, "long_name": name})
+        for column, values, name in zip(
+            columns_of("frame")[:2], (stamps_ns, stamps_ns / 1e9), ("stamp", "time"), strict=True
+        )
     }
     if start_unix_ns:
-        coordinates["time"] = stamps_ns + start_unix_ns, {"units": _EPOCH, "calendar": "proleptic_gregorian"}
+        coordinates["time"] = ["time"], stamps_ns + start_unix_ns, {"units": _EPOCH, "calendar": "proleptic_gregorian"}
     numbers = np.empty(len(frames), np.int64)
     first = frames[0].image
     per_chunk = max(1, min(_CHUNK_BYTES // max(first.nbytes, 1), len(frames)))
@@ -74,7 +78,7 @@ def _write_frames(root: zarr.Group, session: Session, progress: TimeProgress) ->
         fill_value=None,  # xarray reads a fill value as NaN, and 0 is a grey level
     )
     array.attrs.update(
-        {_DIMENSIONS: ["time", "y_px", "x_px"], "description": "grey levels", "bits": session.reader.frame_bits}
+        {_DIMENSIONS: ["time", "y_px", "x_px"], "long_name": "grey level", "bits": session.reader.frame_bits}
     )
     block = np.empty((per_chunk, *first.shape), first.dtype)
     # zarr writes in threads of its own, which an interruption does not end: this one is left when they have.
@@ -90,9 +94,17 @@ def _write_frames(root: zarr.Group, session: Session, progress: TimeProgress) ->
                 chunk = slice(number - place, number + 1)
                 writing.submit(array.__setitem__, chunk, block[: place + 1]).result()
                 progress(seconds(frame.stamp_ns - session.run.first_ns))
-    coordinates["frame_index"] = numbers, {"description": "of the camera; a gap is images that it did not deliver"}
-    for name, (values, attributes) in coordinates.items():
+    described = {"description": "of the camera; a gap is images that it did not deliver"}
+    coordinates["frame_index"] = ["time"], numbers, described
+    pixels = np.arange(first.shape[1]), np.arange(first.shape[0])
+    places_um = session.calibration.to_um(np.stack(np.meshgrid(*pixels), -1)).astype(np.float32)
+    for number, axis in enumerate("xy"):
+        coordinates[f"{axis}_px"] = [f"{axis}_px"], pixels[number], {"units": "px", "long_name": axis}
+        meaning = {"units": "um", "long_name": axis, "description": f"centre of the pixel, {axis} in the chip frame"}
+        coordinates[f"{axis}_um"] = ["y_px", "x_px"], places_um[..., number], meaning
+    for name, (dimensions, values, attributes) in coordinates.items():
         made = root.create_array(name, shape=values.shape, dtype=values.dtype, fill_value=None)
-        made[:] = values
-        made.attrs.update({_DIMENSIONS: ["time"]} | attributes)
-    root["frames"].attrs["coordinates"] = " ".join(name for name in coordinates if name != "time")
+        made[...] = values
+        made.attrs.update({_DIMENSIONS: list(dimensions)} | attributes)
+    named = {"time", "x_px", "y_px"}  # as their dimensions
+    root["frames"].attrs["coordinates"] = " ".join(name for name in coordinates if name not in named)

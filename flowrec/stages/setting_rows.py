@@ -10,6 +10,7 @@ import ast
 import functools
 import inspect
 import io
+import re
 import textwrap
 import tokenize
 from collections.abc import Iterator
@@ -79,7 +80,12 @@ def setting_rows(section: type = Config, prefix: str = "") -> Iterator[SettingRo
 
 def section_summary(section: type) -> str:
     """The first sentence of what a section says of itself."""
-    return " ".join((inspect.getdoc(section) or "").split("\n\n")[0].split())
+    return _for_people(" ".join((inspect.getdoc(section) or "").split("\n\n")[0].split()))
+
+
+def _for_people(text: str) -> str:
+    """A comment as a person who writes TOML reads it: what is None in Python is a key that is not set."""
+    return re.sub(r"\bNone\b", "not set", re.sub(r"(^|\. )None\b", r"\1Not set", text))
 
 
 def toml_value(value: Any) -> str:
@@ -158,7 +164,8 @@ def _meanings(section: type) -> dict[str, str]:
     found: dict[str, str] = {}
     for base in reversed(section.__mro__):
         if is_dataclass(base) and base.__qualname__ in getattr(inspect.getmodule(base), "__dict__", {}):
-            found |= {name: text for name, text in _comments(base).items() if text or name not in found}
+            comments = _comments(base).items()
+            found |= {name: _for_people(text) for name, text in comments if text or name not in found}
     return found
 
 

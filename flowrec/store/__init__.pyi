@@ -47,5 +47,6 @@ from .traffic import (
     HiddenError as HiddenError, MissingError as MissingError, RefusedError as RefusedError,
     TIMEOUT_KEY as TIMEOUT_KEY, TRAFFIC as TRAFFIC, TransientError as TransientError,
 )
-from .viewer_scene import HEIGHT_M as HEIGHT_M
+from .viewer_scene import HEIGHT as HEIGHT, LENGTHS as LENGTHS
+from .viewer_topics import VERDICT as VERDICT
 from .writer import SessionWriter as SessionWriter

@@ -44,6 +44,7 @@ from flowrec.store.mcap_format import Record, Summary
 from flowrec.store.roi import Region, region_from
 from flowrec.store.schema import Schema
 from flowrec.store.session_metadata import SessionMetadata
+from flowrec.store.viewer_scene import LENGTHS, UNIT
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 
 FRAMES, STATE, VIEW = "frames", "state", "view"
@@ -84,7 +85,7 @@ def _own_slots() -> Iterator[tuple[str, Slot]]:
         group = FRAMES if topic.type is Frame else STATE
         yield topic.path, Slot(number, group, message_codec(topic.type).schema, {"role": topic.role.value})
     for number, view in enumerate(VIEWER_TOPICS, len(TOPICS) + 1):
-        yield view.path, Slot(number, VIEW, view.schema, {"role": "view", "made_from": view.source})
+        yield view.path, Slot(number, VIEW, view.schema, {"role": "view", "made_from": view.source, LENGTHS: UNIT})
 
 
 SLOTS: dict[str, Slot] = dict(_own_slots())
@@ -121,8 +122,8 @@ def declarations(
             metadata |= region.notes if region is not None else {}
         if schema.name not in schemas:
             schemas[schema.name] = len(schemas) + 1
-            yield SchemaRecord(id=schemas[schema.name], data=schema.data, encoding="protobuf", name=schema.name)
-        yield Channel(slot.channel, path, "protobuf", metadata, schemas[schema.name])
+            yield SchemaRecord(id=schemas[schema.name], data=schema.data, encoding=schema.encoding, name=schema.name)
+        yield Channel(slot.channel, path, schema.message_encoding, metadata, schemas[schema.name])
 
 
 def is_left_out(path: str, patterns: Iterable[str]) -> bool:

@@ -214,7 +214,7 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
         out.add(Metadata(OUTCOME, kept.outcome))
         if copier.draws:
             camera, start_unix_ns = ChipCamera.of(contents.header), contents.source.start_unix_ns
-            draw(draft, out, camera, start_unix_ns, _left_out(contents))
+            draw(draft, out, camera, start_unix_ns, _left_out(contents), kept.outcome)
         out.add_digest()
         out.finish()
         out.sync()

@@ -1,4 +1,5 @@
 """Protobuf schemas: ours derived from the dataclasses of core/messages, the standard ones taken from foxglove-sdk.
+Besides them two of ROS 2, whose messages Rerun shows without a layout.
 
 This file defines the wire layout. Fields are numbered in the order of the dataclass:
 
@@ -36,18 +37,21 @@ _files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """One protobuf message type.
+    """One message type.
 
     Attributes
     ----------
     name : full name, `flowrec.Track`.
-    data : serialized FileDescriptorSet with everything it depends on.
-    wire : the class that holds one such message.
+    data : serialized FileDescriptorSet with everything it depends on; of ROS 2 the text of its definition.
+    wire : the class that holds one such message; None of ROS 2.
+    encoding, message_encoding : of the schema and of its messages, as MCAP names them.
     """
 
     name: str
     data: bytes
     wire: Any
+    encoding: str = "protobuf"
+    message_encoding: str = "protobuf"
 
 
 @functools.cache
@@ -105,6 +109,11 @@ def plot_schema(name: str, numbers: Iterable[str], lists: Iterable[str] = ()) ->
     for number, (each, label) in enumerate(labels, 2):
         message.field.add(name=each, number=number, type=_Field.TYPE_FLOAT, label=label)
     return _add(file)
+
+
+def ros_schema(name: str, definition: str) -> Schema:
+    """A schema of ROS 2 with the text of its definition; its messages are encoded as CDR."""
+    return Schema(name, definition.encode(), None, "ros2msg", "cdr")
 
 
 def _new(

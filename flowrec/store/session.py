@@ -35,6 +35,7 @@ from flowrec.store.session_path import session_path
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
+    import xarray
     from numpy.typing import NDArray
 
     from flowrec.core import Event, FlowField, Tick
@@ -57,6 +58,23 @@ class FlowFields(dict[str, "FlowField"]):
 
     def __repr__(self) -> str:
         return "\n".join(f"{name:8s}  {field!r}" for name, field in self.items()) or "no flow field"
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All of them as one Dataset along the dimension `field`: FlowField.to_xarray, with time and method of each.
+
+        A standard deviation that a method does not state is NaN.
+
+        Raises
+        ------
+        UsageError : there is no field, or xarray is not installed.
+        """
+        if not self:
+            raise UsageError("there is no flow field to make a Dataset of")
+        data = [field.to_xarray() for field in self.values()]
+        import xarray as xr  # is installed: it made `data`
+
+        every = xr.concat(data, xr.Variable("field", list(self)), combine_attrs="drop_conflicts", join="exact")
+        return every.assign_coords(method=("field", [field.method for field in self.values()]))
 
 
 class Session:

@@ -349,7 +349,8 @@ class SessionFile:
         with self._mark_failed():
             self._file.add(Metadata(OUTCOME, dict(outcome)))  # before the drawings: without them nothing is lost
             if self.partial_path.exists():  # else its folder was renamed: recovery draws
-                draw(self.partial_path, self._file, camera, self._start_unix_ns, self._options.left_out_topics)
+                left_out = self._options.left_out_topics
+                draw(self.partial_path, self._file, camera, self._start_unix_ns, left_out, outcome)
             self._file.add_digest()
             self._file.finish()
             self._file.sync()

@@ -1,4 +1,4 @@
-"""Robot, route, goal and maps as messages of foxglove's schemas: as points in m on the chip, and on the camera's image.
+"""Robot, route, goal and maps as messages of foxglove's schemas: in mm on the chip, and in px on the camera's image.
 
 Rerun draws points and images, Foxglove draws all of it. Both flow previews use one colour scale, viridis from 0 to the
 highest speed of the first field; solid is black.
@@ -14,7 +14,7 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.core import M_PER_UM, Estimate, FlowField, Route, Track
+from flowrec.core import MM_PER_UM, Estimate, FlowField, Route, Track, fluid_of
 from flowrec.store.codec import Payload, byte_field_head
 from flowrec.store.viewer_scene import CHIP, MAP, STILL, Picture, ViewerScene, speed_um_s
 
@@ -28,6 +28,7 @@ _ROUNDING = np.uint32(1 << 11)  # half of the last bit kept of a float's 23; the
 _NO_COLOUR = fg.Color(r=0.0, g=0.0, b=0.0, a=0.0)
 Rgba = tuple[int, int, int, int]
 _ROBOT, _UNSEEN, _PATH, _GOAL = (255, 112, 32, 255), (200, 200, 200, 255), (0, 216, 255, 255), (64, 255, 96, 255)
+_WALL, _WALL_POINTS = (130, 130, 130, 255), 4000  # points at most
 
 
 def transforms(stamp_ns: int, scene: ViewerScene) -> Payload:
@@ -42,7 +43,7 @@ def camera(picture: Picture, _scene: ViewerScene) -> Payload:
 
 
 def robot_pose(robot: Estimate | Track, scene: ViewerScene) -> Payload:
-    """Pose of the robot on the chip, in m."""
+    """Pose of the robot on the chip, in mm."""
     return _pose_field(*scene.place_um(robot.position_um)), _IN_CHIP
 
 
@@ -62,12 +63,12 @@ def robot_mark(robot: Estimate | Track, scene: ViewerScene) -> Payload:
 
 
 def path(route: Route, _scene: ViewerScene) -> Payload:
-    """The route as poses on the chip, in m."""
+    """The route as poses on the chip, in mm."""
     return (fg.PosesInFrame(frame_id=CHIP, poses=[_pose(x, y) for x, y in route.waypoints_um.tolist()]).encode(),)
 
 
 def path_points(route: Route, _scene: ViewerScene) -> Payload:
-    """The route as points on the chip, in m."""
+    """The route as points on the chip, in mm."""
     return (_cloud(route.waypoints_um, _PATH).encode(),)
 
 
@@ -114,21 +115,47 @@ def distance_um(points_um: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate((np.zeros(min(len(points_um), 1)), np.cumsum(steps)))
 
 
-def preview(field: FlowField, scene: ViewerScene) -> Payload:
-    """The speed of a flow as an image."""
+def walls(field: FlowField, _scene: ViewerScene) -> Payload:
+    """The outline of the fluid as points on the chip: what Rerun's 3-D view takes its size from, before a route."""
+    outlines, _ = cv2.findContours(fluid_of(field).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    points_px = np.concatenate([np.zeros((0, 2)), *(outline[:, 0] for outline in outlines)])
+    every = -(-len(points_px) // _WALL_POINTS) or 1
+    return (_cloud(field.um_per_px * points_px[::every], _WALL).encode(),)
+
+
+def preview(field: FlowField | None, scene: ViewerScene) -> Payload:
+    """The speed of a flow as an image; without one an image that says so, because its view would be empty."""
+    if field is None:
+        return _image(_no_flow(scene))
     speed = speed_um_s(field)
     solid = speed == 0.0
     speed *= 255.0 / (scene.top_um_s or 1.0)
     grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
     colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
     colours[solid] = 0
-    data = cv2.imencode(".png", colours)[1].tobytes()
+    return _image(colours)
+
+
+def _image(pixels: NDArray[Any]) -> Payload:
+    data = cv2.imencode(".png", pixels)[1].tobytes()
     return (fg.CompressedImage(frame_id=MAP, data=data, format="png").encode(),)
 
 
+def _no_flow(scene: ViewerScene) -> NDArray[np.uint8]:
+    """(h, w) grey levels of the size of the map."""
+    assert scene.field is not None
+    (h, w), text = scene.field.velocity_um_s.shape[:2], "no refined flow"
+    picture: NDArray[np.uint8] = np.zeros((h, w), np.uint8)
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
+    scale = 0.8 * w / width
+    place = int(0.1 * w), int(0.5 * (h + scale * height))
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 160, 1, cv2.LINE_AA)
+    return picture
+
+
 def grid(field: FlowField, _scene: ViewerScene) -> Payload:
-    """A flow in um/s on cells in m, with a relative precision of 2^-12: the topic of the field has all digits."""
-    (height, width), size_m = field.velocity_um_s.shape[:2], M_PER_UM * field.um_per_px
+    """A flow in um/s on cells in mm, with a relative precision of 2^-12: the topic of the field has all digits."""
+    (height, width), size_mm = field.velocity_um_s.shape[:2], MM_PER_UM * field.um_per_px
     values = np.empty((height, width, 3), "<f4")
     values[..., :2], values[..., 2] = field.velocity_um_s, speed_um_s(field)
     bits = values.view("<u4")
@@ -138,7 +165,7 @@ def grid(field: FlowField, _scene: ViewerScene) -> Payload:
         frame_id=CHIP,
         pose=_pose(-0.5 * field.um_per_px, -0.5 * field.um_per_px),  # the corner of pixel (0, 0)
         column_count=width,
-        cell_size=fg.Vector2(x=size_m, y=size_m),
+        cell_size=fg.Vector2(x=size_mm, y=size_mm),
         row_stride=values.strides[0],
         cell_stride=values.strides[1],
         fields=_float_fields("vx_um_s", "vy_um_s", "speed_um_s"),
@@ -148,7 +175,7 @@ def grid(field: FlowField, _scene: ViewerScene) -> Payload:
 
 
 def _pose(x_um: float, y_um: float) -> fg.Pose:
-    place = fg.Vector3(x=M_PER_UM * x_um, y=M_PER_UM * y_um, z=0.0)
+    place = fg.Vector3(x=MM_PER_UM * x_um, y=MM_PER_UM * y_um, z=0.0)
     return fg.Pose(position=place, orientation=STILL)
 
 
@@ -174,7 +201,7 @@ def _circle_points() -> NDArray[np.float64]:
 def _cloud(points_um: NDArray[np.float64], rgba: Rgba, *, placed: bool = True) -> fg.PointCloud:
     """Points (n, 2) on the chip; they are about a pose that follows where they are not `placed`."""
     points = np.zeros(len(points_um), [("at", "<f4", 3), ("colour", "u1", 4)])
-    points["at"][:, :2], points["colour"] = M_PER_UM * points_um, rgba
+    points["at"][:, :2], points["colour"] = MM_PER_UM * points_um, rgba
     colours = [
         fg.PackedElementField(name=name, offset=12 + place, type=fg.PackedElementFieldNumericType.Uint8)
         for place, name in enumerate(("red", "green", "blue", "alpha"))

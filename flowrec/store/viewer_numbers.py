@@ -1,22 +1,46 @@
 """Numbers that viewers plot and that the recorded messages hold as arrays or not at all: the flow where the robot is,
-the newest observation, and the flow along the route, each beside what the map says there.
+the newest observation, and the flow along the route, each beside what the map says there; and the end of the run.
 
-All are derived for viewers; evaluations use the recorded messages, which have all digits.
+What has a schema of ROS 2, a number or a text each, Rerun plots and shows without a layout, titled by its topic. All is
+derived for viewers; evaluations use the recorded messages, which have all digits.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import struct
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flowrec.core import Estimate, Observations, Route, Track
+from flowrec.core import (
+    Demand,
+    Estimate,
+    Observations,
+    Route,
+    Track,
+    doubts_of,
+    flow_text,
+    of_text,
+    printable,
+    text_of_figure,
+    way_text,
+    with_micro,
+)
 from flowrec.store.codec import Payload
-from flowrec.store.schema import plot_schema
+from flowrec.store.schema import plot_schema, ros_schema
 from flowrec.store.viewer_drawings import distance_um, thin_line
 from flowrec.store.viewer_scene import ViewerScene
 
+_RULE = "=" * 80
+NUMBER = ros_schema(
+    "std_msgs/msg/Float64MultiArray",
+    f"std_msgs/MultiArrayLayout layout\nfloat64[] data\n{_RULE}\nMSG: std_msgs/MultiArrayLayout\n"
+    f"std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n{_RULE}\nMSG: std_msgs/MultiArrayDimension\n"
+    "string label\nuint32 size\nuint32 stride\n",
+)
+TEXT = ros_schema("std_msgs/msg/String", "string data\n")
+_CDR = b"\x00\x01\x00\x00"  # little-endian
 _ROUTE_POINTS = 200  # along a route, at most; more are not visible
 
 # Places are on the chip; the map is the refined flow, before there is one the assumed one. NaN: not known.
@@ -64,6 +88,46 @@ def robot_flow(robot: Estimate | Track, scene: ViewerScene) -> Payload:
     flow = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
     numbers, _ = _beside_map(scene, scene.place_um(robot.position_um), flow)
     return (ROBOT_FLOW.wire(**numbers, map_error_share=scene.map_error_share).SerializeToString(),)
+
+
+def flow_speed(robot: Estimate | Track, scene: ViewerScene) -> Payload:
+    """Speed of the flow where the robot is, by the observer."""
+    return _number(math.hypot(*robot.flow_um_s.tolist()) if isinstance(robot, Estimate) else math.nan)
+
+
+def flow_difference(robot: Estimate | Track, scene: ViewerScene) -> Payload:
+    """Length of the difference of the observer's flow and the map's."""
+    flow = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
+    return _number(_beside_map(scene, scene.place_um(robot.position_um), flow)[0]["difference_um_s"])
+
+
+def tracking_error(demand: Demand, _scene: ViewerScene) -> Payload:
+    """Distance to the reference."""
+    return _number(demand.error_um)
+
+
+def verdict(outcome: Mapping[str, str], scene: ViewerScene) -> Payload:
+    """The end of the run, what was won, doubts, and what the colours mean, a line each."""
+    figures = of_text(outcome)
+    ended, duration = outcome.get("outcome", "not finished"), figures.get("duration_s")
+    after = f" after {text_of_figure('duration_s', duration)}" if duration is not None else ""
+    top = f"; speed of the maps: 0 (violet) to {scene.top_um_s:.0f} um/s (yellow)" if scene.top_um_s else ""
+    lines = (
+        f"{ended}{after}",
+        way_text(figures),
+        flow_text(figures),
+        outcome.get("note", ""),
+        *(f"doubtful: {each}" for each in doubts_of(outcome)),
+        f"robot: orange; route: cyan; goal: green{top}; a square of the 3-D view: 1 mm",
+        "more, with error bars: flowrec view FILE",
+    )
+    data = with_micro("\n\n".join(printable(line) for line in lines if line)).encode() + b"\0"
+    return (_CDR, struct.pack("<I", len(data)), data)
+
+
+def _number(value: float) -> Payload:
+    """One number as an array without dimensions."""
+    return (_CDR, struct.pack("<III4xd", 0, 0, 1, value))
 
 
 def observation(observations: Observations, scene: ViewerScene) -> Payload:

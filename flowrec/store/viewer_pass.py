@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from flowrec.store.channels import VIEWED
@@ -14,7 +15,14 @@ from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.store.viewer_topics import INPUTS, ViewerTopics
 
 
-def draw(path: Path, out: McapWriter, camera: ChipCamera | None, start_unix_ns: int, left_out: frozenset[str]) -> None:
+def draw(
+    path: Path,
+    out: McapWriter,
+    camera: ChipCamera | None,
+    start_unix_ns: int,
+    left_out: frozenset[str],
+    outcome: Mapping[str, str],
+) -> None:
     """Add the viewer topics to a file that holds all of its messages, and none of these topics.
 
     Parameters
@@ -23,6 +31,7 @@ def draw(path: Path, out: McapWriter, camera: ChipCamera | None, start_unix_ns: 
     camera : of the session; None if its settings are not known.
     start_unix_ns : Unix time of stamp 0.
     left_out : viewer topics that are not wanted.
+    outcome : of the run.
 
     Raises
     ------
@@ -37,8 +46,14 @@ def draw(path: Path, out: McapWriter, camera: ChipCamera | None, start_unix_ns: 
     encoder = ChunkEncoder(ENCODINGS["raw"], out.add_chunks, start_unix_ns)
     with FileReader(path, summary=summary) as file:
         views = ViewerTopics(ViewerScene(camera, start_unix_ns), left_out)
+        first_ns: int | None = None
         for log_ns, messages in file.new_messages(None, fields=INPUTS):
+            first_ns = log_ns if first_ns is None else first_ns
             for topic, stamp_ns, payload in views.of(messages):
                 encoder.append(topic, log_ns, Encoded(stamp_ns, None, payload))
             encoder.seal_full()
+        if first_ns is not None:
+            encoder.seal()  # a chunk of its own: in one, times increase
+            for topic, stamp_ns, payload in views.of_end(outcome, first_ns):
+                encoder.append(topic, first_ns, Encoded(stamp_ns, None, payload))
     encoder.seal()

@@ -1,10 +1,11 @@
 """State that viewers need to draw a session: coordinate frames, cameras, and the map, route and goal of the moment.
 
-Frames, in m: `chip` has its origin at the centre of the mask's pixel (0, 0), x right, y down, z away from who looks at
+Frames, in mm: `chip` has its origin at the centre of the mask's pixel (0, 0), x right, y down, z away from who looks at
 the mask; all that is drawn lies in its plane z = 0. `camera` and `map` are pinhole cameras (x right, y down, z ahead)
 that look straight at that plane and show on it the camera's image and the pixels of the mask; what lies in one plane
 has no perspective, so the height is of no importance. The camera of a mirrored image looks from the other side. The
-root of the tree is `tf#/`, which Rerun gives to all that has no frame.
+root of the tree is `tf#/`, which Rerun gives to all that has no frame; its z points to who looks at the mask. Rerun's
+own 3-D view looks down on what is some units wide: a chip in mm; of one in m it shows nothing.
 
 Pixels are counted from the corner of the first one, as foxglove's schemas and both viewers count them; flowrec counts
 from its centre. https://docs.foxglove.dev/docs/sdk/schemas/camera-calibration
@@ -22,7 +23,7 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.core import M_PER_UM, FlowField, FlowrecError, Matrix, Message, Mission, Route, Shift, shift_px
+from flowrec.core import MM_PER_UM, FlowField, FlowrecError, Matrix, Message, Mission, Route, Shift, shift_px
 from flowrec.physics import Calibration, on_chip
 from flowrec.store.codec import timestamp
 from flowrec.store.frame_encodings import CAMERA_FRAME
@@ -30,12 +31,12 @@ from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_metadata import SessionHeader
 
 ROOT, CHIP, MAP = "tf#/", "chip", "map"
-# Of the cameras over the chip. Rerun clips what is nearer than 0.1 m; Foxglove's depth buffer resolves 2 um there.
-HEIGHT_M = 0.2
+LENGTHS, UNIT = "lengths", "mm"  # key and value in the metadata of viewer topics; absent in older files: m
+HEIGHT = {"mm": 3.0, "m": 0.2}  # of the cameras over the chip; Rerun clips what is nearer than 0.1
 _HALF_PX = 0.5
 _RADIUS_UM = 60.0  # of a robot whose size is not known
 _Number = TypeVar("_Number", float, NDArray[np.float64])
-STILL = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+STILL, _OVER = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0), fg.Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ class Picture:
 
     def calibration(self) -> fg.CameraCalibration:
         """The pinhole camera: focal length by its height, principal point in the middle of the image."""
-        f, cx, cy = HEIGHT_M / (self.um_per_px * M_PER_UM), 0.5 * self.width_px, 0.5 * self.height_px
+        f, cx, cy = HEIGHT[UNIT] / (self.um_per_px * MM_PER_UM), 0.5 * self.width_px, 0.5 * self.height_px
         return fg.CameraCalibration(
             frame_id=self.frame,
             width=self.width_px,
@@ -92,13 +93,13 @@ class Picture:
     def transform(self) -> fg.FrameTransform:
         """Pose of the pinhole camera: over the middle of the image, or behind it if that is mirrored."""
         middle = np.array([0.5 * self.width_px - _HALF_PX, 0.5 * self.height_px - _HALF_PX, 1.0])
-        x, y = (M_PER_UM * (self.matrix @ middle)).tolist()
+        x, y = (MM_PER_UM * (self.matrix @ middle)).tolist()
         angle_rad = math.atan2(self.matrix[1, 0], self.matrix[0, 0])  # of the rows of pixels, from x to y
         sin, cos = math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)
         # A turn about z; of a picture that shows the chip as in a mirror half a turn about x before it.
-        turn, height = {"x": 0.0, "y": 0.0, "z": sin, "w": cos}, -HEIGHT_M
+        turn, height = {"x": 0.0, "y": 0.0, "z": sin, "w": cos}, -HEIGHT[UNIT]
         if self._determinant < 0.0:
-            turn, height = {"x": cos, "y": sin, "z": 0.0, "w": 0.0}, HEIGHT_M
+            turn, height = {"x": cos, "y": sin, "z": 0.0, "w": 0.0}, HEIGHT[UNIT]
         return fg.FrameTransform(
             parent_frame_id=CHIP,
             child_frame_id=self.frame,
@@ -154,6 +155,7 @@ class ViewerScene:
     camera : of the session; None if its settings are not known.
     start_unix_ns : Unix time of stamp 0.
     top_um_s : speed at the bright end of the colour scale; None before the first flow field.
+    refined : the refined flow; None before there is one.
     field : the best flow known: refined where there is one, else assumed.
     route, goal_um : the latest; None without one.
     picture, map : the camera's image and the pixels of the flow on the chip; None where they are not known.
@@ -163,12 +165,12 @@ class ViewerScene:
         self.camera = camera
         self.start_unix_ns = start_unix_ns
         self.top_um_s: float | None = None
+        self.refined: FlowField | None = None
         self.field: FlowField | None = None
         self.route: Route | None = None
         self.goal_um: NDArray[np.float64] | None = None
         self.picture = camera.picture(None) if camera is not None else None
         self.map: Picture | None = None
-        self._refined: FlowField | None = None
         self._shift: Shift | None = None
 
     @property
@@ -185,9 +187,9 @@ class ViewerScene:
     def place_um(self, measured_um: NDArray[np.float64]) -> tuple[float, float]:
         """Place on the chip of one measured place (2,), quicker than `on_chip` of flowrec.physics."""
         x, y = measured_um.tolist()
-        if self._refined is None or self._refined.registration is None:
+        if self.refined is None or self.refined.registration is None:
             return x, y
-        (xx, xy, x0), (yx, yy, y0) = self._refined.registration.tolist()
+        (xx, xy, x0), (yx, yy, y0) = self.refined.registration.tolist()
         return xx * x + xy * y + x0, yx * x + yy * y + y0
 
     def update(self, messages: Mapping[str, Message]) -> None:
@@ -198,14 +200,14 @@ class ViewerScene:
                 if self.top_um_s is None:
                     self.top_um_s = float(speed_um_s(field).max()) or 1.0
                 if name == "refined":
-                    self._refined = field
-                if name == "refined" or self._refined is None:
+                    self.refined = field
+                if name == "refined" or self.refined is None:
                     self.field = field
                 self.map = _map(field) or self.map
         shift, route, mission = (messages.get(name) for name in ("shift", "route", "mission"))
         if isinstance(shift, Shift):
             self._shift = shift
-        refined = self._refined
+        refined = self.refined
         moved = isinstance(shift, Shift) or (refined is not None and refined is messages.get("refined"))
         if moved and self.camera is not None:
             self.picture = self.camera.picture(None if refined is None else refined.registration, self._shift)
@@ -216,7 +218,7 @@ class ViewerScene:
 
     def transforms(self) -> list[fg.FrameTransform]:
         """The tree of the frames that are known."""
-        chip = fg.FrameTransform(parent_frame_id=ROOT, child_frame_id=CHIP, translation=fg.Vector3(), rotation=STILL)
+        chip = fg.FrameTransform(parent_frame_id=ROOT, child_frame_id=CHIP, translation=fg.Vector3(), rotation=_OVER)
         return [chip, *(picture.transform() for picture in (self.picture, self.map) if picture is not None)]
 
     def stamp(self, stamp_ns: int) -> bytes:

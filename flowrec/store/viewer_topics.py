@@ -6,13 +6,14 @@ image's topic, because Rerun's own layout of a file shows an image with all that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from flowrec.core import NS_PER_S, Estimate, FlowField, Message, Observations, Track
+from flowrec.core import NS_PER_S, Demand, Estimate, FlowField, Message, Observations, Track
 from flowrec.store import viewer_drawings as drawings
 from flowrec.store import viewer_numbers as numbers
 from flowrec.store.codec import Payload
@@ -20,9 +21,10 @@ from flowrec.store.schema import Schema, foxglove_schema
 from flowrec.store.viewer_scene import ViewerScene, drawable
 
 # The fields of Tick that viewer topics are made of.
-INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations"))
+INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations", "demand"))
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
 _NEVER = -(1 << 62)
+VERDICT = "/verdict"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,11 @@ class ViewerTopics:
         self._scene = ViewerScene() if scene is None else scene
         self._drawn: dict[str, tuple[object, ...]] = {"frames": (None, None), "goal": (None,)}  # what, by name
         self._robot_ns = _NEVER
+
+    def of_end(self, outcome: Mapping[str, str], stamp_ns: int) -> Iterator[tuple[str, int, Payload]]:
+        """As `of`, of the outcome of the run, when all of its messages are drawn; the stamp is that of its begin."""
+        for view in self._views.get("outcome", ()):
+            yield view.path, stamp_ns, view.make(outcome, self._scene)
 
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
         """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""
@@ -94,6 +101,11 @@ class ViewerTopics:
             yield "marks", last_ns, last_ns
         if scene.route is not None and ("route" in messages or scene.field in messages.values()):
             yield "route on map", last_ns, scene.route
+        demand = messages.get("demand")
+        # NaN is a gap in the line; before the first number it would be a plot without a line.
+        if isinstance(demand, Demand) and ("error" in self._drawn or math.isfinite(demand.error_um)):
+            self._drawn["error"] = ()
+            yield "demand", demand.stamp_ns, demand
         observations = messages.get("observations")
         if isinstance(observations, Observations) and observations.position_um.shape[1:] == (2,):
             yield "observations", observations.stamp_ns, observations
@@ -101,6 +113,10 @@ class ViewerTopics:
             field = messages.get(name)
             if isinstance(field, FlowField) and drawable(field):
                 yield name, field.stamp_ns, field
+                if name == "refined":
+                    yield "refined picture", field.stamp_ns, field
+                elif scene.refined is None and self._is_new("no refined flow", True):
+                    yield "refined picture", field.stamp_ns, None
 
     def _is_new(self, name: str, *made_of: object) -> bool:
         """True if a drawing was last made of something else; then it is noted as made of this."""
@@ -128,9 +144,21 @@ VIEWER_TOPICS = (
     ViewerTopic("/camera/frame/goal", _POINTS, "goal", "mission", drawings.goal_points),
     ViewerTopic("/view/robot_mark", _MARKS, "robot on picture", _ROBOT, drawings.robot_mark, False),
     ViewerTopic("/view/route_mark", _MARKS, "marks", "route, mission, refined", drawings.route_mark, False),
+    ViewerTopic("/view/walls", _POINTS, "assumed", "assumed", drawings.walls),
     ViewerTopic("/view/flow_assumed", _IMAGE, "assumed", "assumed", drawings.preview),
-    ViewerTopic("/view/flow_refined", _IMAGE, "refined", "refined", drawings.preview),
+    ViewerTopic("/view/flow_refined", _IMAGE, "refined picture", "refined", drawings.preview),
     ViewerTopic("/view/flow_refined_grid", _GRID, "refined", "refined", drawings.grid),
+    ViewerTopic(VERDICT, numbers.TEXT, "outcome", "outcome of the run", numbers.verdict, False),
+    ViewerTopic("/view/flow_at_robot_um_s", numbers.NUMBER, "robot", "estimate", numbers.flow_speed, False),
+    ViewerTopic(
+        "/view/flow_difference_um_s",
+        numbers.NUMBER,
+        "robot",
+        "estimate, assumed, refined",
+        numbers.flow_difference,
+        False,
+    ),
+    ViewerTopic("/view/tracking_error_um", numbers.NUMBER, "demand", "demand", numbers.tracking_error, False),
     ViewerTopic("/view/robot_flow", numbers.ROBOT_FLOW, "robot", f"{_ROBOT}; assumed, refined", numbers.robot_flow),
     ViewerTopic("/view/observation", numbers.OBSERVATION, "observations", "observations", numbers.observation),
     ViewerTopic("/view/route_flow", numbers.ROUTE_FLOW, "route on map", "route, assumed, refined", numbers.route_flow),

@@ -16,7 +16,7 @@ from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 from flowrec.core import FIXED, Role, TopicTable, UsageError, printable, seconds
-from flowrec.store import FRAME_PATH, Session, SessionHeader, SessionMetadata, is_header_file, toml_table
+from flowrec.store import FRAME_PATH, VERDICT, Session, SessionHeader, SessionMetadata, is_header_file, toml_table
 
 HEAD = (
     *("configuration", "chip", "provenance", "parent", "outcome"),
@@ -228,7 +228,7 @@ class RawTopic:
 
 
 def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, RawTopic]:
-    """The topics of a session as they are in the file, but for images.
+    """The topics of a session as they are in the file, but for images, and for the verdict, which tells the outcome.
 
     The copies with which a part of a run begins are left out, as by a reader.
     """
@@ -238,7 +238,7 @@ def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, Raw
             wanted = {
                 number: channel.topic
                 for number, channel in opened.channels.items()
-                if channel.topic != FRAME_PATH and chosen(channel.topic)
+                if channel.topic not in (FRAME_PATH, VERDICT) and chosen(channel.topic)
             }
             for chunk in opened.chunks:
                 if chunk.message_index_offsets and not wanted.keys() & chunk.message_index_offsets.keys():

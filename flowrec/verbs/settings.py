@@ -1,6 +1,5 @@
 """`flowrec settings`: meaning, unit, range and default of each setting."""
 
-import difflib
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,6 +53,7 @@ def settings(
     ------
     UsageError : there is no such setting.
     """
+    from flowrec.core import nearest_settings
     from flowrec.stages import Config, section_summary, setting_rows
 
     rows = [*setting_rows()]
@@ -69,8 +69,7 @@ def settings(
     found = [row for row in rows if row.key == about or row.key.startswith(f"{about}.")]
     if not found:
         keys = [row.key for row in rows]
-        names = sorted({key[:end] for key in keys for end in (len(key), key.rfind("."), key.find(".")) if end > 0})
-        by_name = [key for key in keys if key.rpartition(".")[2] == about.rpartition(".")[2]]
-        near = by_name[:3] or difflib.get_close_matches(about, names, 3, 0.5) or ["plan", "mission"]
+        sections = {key[:end] for key in keys for end in (key.rfind("."), key.find(".")) if end > 0}
+        near = nearest_settings(about, [*keys, *sorted(sections)]) or ["plan", "mission"]
         raise UsageError(f"{about}: no such setting; did you mean {' or '.join(near)}? flowrec settings lists all")
     return ExplainedSettings(found)

@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from flowrec.store import SLOTS
+from flowrec.store import SLOTS, VERDICT
 from flowrec.view import colours
 from flowrec.view.bare_plots import EVENTS, IMAGE, MAPS, ON_IMAGE, PLOTS, STATES, Plot
 from flowrec.view.blueprint import LEGEND, axis_of, events_view, existing, layout_of, legend_of, tabs
@@ -40,7 +40,9 @@ def bare_blueprint(
     )
     lanes = rrb.StateTimelineView(name="Mission", origin=_MISSION, overrides={_MISSION: state})
     above = existing([camera, rrb.Vertical(*maps) if maps else None])
-    texts = rrb.Vertical(lanes, events_view(EVENTS), row_shares=[0.38, 0.62])
+    verdict = rrb.TextDocumentView(name="Verdict", origin=VERDICT) if VERDICT in present else None
+    shown = existing([verdict, lanes, events_view(EVENTS)])
+    texts = rrb.Vertical(*shown, row_shares=[0.6, 0.38, 0.62][-len(shown) :])
     below = rrb.Horizontal(texts, *plots, column_shares=[0.3, *(0.7 / len(plots) for _ in plots)])
     body = rrb.Vertical(rrb.Horizontal(*above, column_shares=[0.6, 0.4][: len(above)]), below, row_shares=[0.6, 0.4])
     return layout_of(body if above else below, timeline=LOG_TIME)

@@ -9,25 +9,38 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from flowrec.store import HEIGHT_M
+from flowrec.store import HEIGHT
 from flowrec.view.bare_plots import EVENTS, IMAGE, ON_IMAGE, PLOTS, ROUTE, STATES, Plot
 
 _COLOURS = ("#4e98e2", "#f5774d", "#f7df71")
 _MAP = "/view/flow_refined"
+_VIRIDIS = ("#440154ff", "#fde725ff")  # its ends: the colours of the other pictures
+# Of points. Without a mode and a field Foxglove colours them by x.
+_OWN_COLOURS = {"colorMode": "rgba-fields", "colorField": "red"}
 
 Panel = dict[str, Any]
 
 
-def foxglove_layout(centre_m: tuple[float, float], size_m: float, extra: Sequence[Plot] = ()) -> dict[str, Any]:
-    """The layout as JSON data, for a chip with this centre and longer side; `extra`: plots of the extra topics."""
+def foxglove_layout(
+    centre: tuple[float, float],
+    size: float,
+    extra: Sequence[Plot] = (),
+    unit: str = "mm",
+    top_um_s: float | None = None,
+) -> dict[str, Any]:
+    """The layout as JSON data, for a chip with this centre and longer side in a unit; `extra`: plots of extra topics.
+
+    `unit` is that of the lengths in the file's viewer topics, m in files of older flowrec; `top_um_s` the highest speed
+    of the refined flow, None without one.
+    """
     panels: dict[str, Panel] = {
         "Image!camera": _image("Camera", IMAGE, "/view/camera"),
         "Image!map": _image("Refined flow", _MAP, "/view/map"),
-        "3D!chip": _chip(centre_m, size_m),
+        "3D!chip": _chip(centre, size, unit, top_um_s),
         "Plot!route": _along_route(),
         "StateTransitions!states": _states(),
-        "RosOut!log": {"searchTerms": [], "minLogLevel": 1, "topicToRender": EVENTS[0]},
-        "Tab!maps": _tab({"Refined flow": "Image!map", "Chip (m)": "3D!chip"}),
+        "RosOut!log": {"searchTerms": [], "preload": True, "minLogLevel": 1, "topicToRender": EVENTS[0]},
+        "Tab!maps": _tab({"Refined flow": "Image!map", f"Chip ({unit})": "3D!chip"}),
     }
     groups = PLOTS | ({"extra": tuple(extra)} if extra else {})
     for name, group in groups.items():
@@ -58,36 +71,38 @@ def _image(title: str, topic: str, calibration: str) -> Panel:
             "annotations": {name: {"visible": in_pixels} for name in ("/view/route_mark", "/view/robot_mark")},
             "synchronize": False,
         },
-        "topics": {name: {"visible": not in_pixels, "pointSize": 3} for name in ON_IMAGE},
+        "topics": {name: {"visible": not in_pixels, "pointSize": 3, **_OWN_COLOURS} for name in ON_IMAGE},
         "followTf": "chip",
     }
 
 
-def _chip(centre_m: tuple[float, float], size_m: float) -> Panel:
+def _chip(centre: tuple[float, float], size: float, unit: str, top_um_s: float | None) -> Panel:
     """Flow, route and robot on the chip, seen from where the camera is: x to the right, y down."""
-    grid = {"visible": True, "colorMode": "colormap", "colorMap": "turbo", "colorField": "speed_um_s"}
+    grid: Panel = {"visible": True, "colorMode": "gradient", "gradient": list(_VIRIDIS), "colorField": "speed_um_s"}
+    if top_um_s:
+        grid |= {"minValue": 0.0, "maxValue": top_um_s}  # by itself Foxglove takes 0 to 1
     return {
-        "foxglovePanelTitle": "Chip (m)",
+        "foxglovePanelTitle": f"Chip ({unit})",
         "cameraState": {
             # Only a camera with perspective can look along z.
             "perspective": True,
-            "distance": 1.4 * size_m,
+            "distance": 1.4 * size,
             "phi": 180,
             "thetaOffset": 0,
             "target": [0, 0, 0],
-            "targetOffset": [*centre_m, 0],
+            "targetOffset": [*centre, 0],
             "targetOrientation": [0, 0, 0, 1],
             "fovy": 45,
-            "near": 0.0001,
-            "far": 10,
+            "near": 0.01 * size,
+            "far": 1000.0 * size,
         },
         "followMode": "follow-none",
         "followTf": "chip",
-        "scene": {"transforms": {"showLabel": False, "axisScale": 0.0, "lineWidth": 0.0}},
+        "scene": {"transforms": {"showLabel": False, "axisSize": 0.0, "axisScale": 0.0, "lineWidth": 0.0}},
         "topics": {
-            **{name: {"visible": True, "pointSize": 4} for name in ON_IMAGE},
+            **{name: {"visible": True, "pointSize": 4, **_OWN_COLOURS} for name in ON_IMAGE},
             "/view/flow_refined_grid": grid,
-            IMAGE: {"visible": False, "cameraInfoTopic": "/view/camera", "distance": HEIGHT_M},
+            IMAGE: {"visible": False, "cameraInfoTopic": "/view/camera", "distance": HEIGHT[unit]},
         },
         "layers": {},
     }

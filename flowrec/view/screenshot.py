@@ -122,6 +122,8 @@ def _wait_loaded(client: ViewerClient) -> ViewerState | None:
 def _why(log: Path) -> str:
     """The reason that the viewer's log states."""
     text = log.read_text(errors="replace")
+    if "No glyph for" in text:
+        return "without a window it can not draw a character of the file that its font lacks; in a window it does"
     if "render context" in text or "adapter" in text:
         return (
             "it has no graphics to draw with: install a driver, or `apt install mesa-vulkan-drivers` for a software one"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from flowrec.stages.config import Config, load_config, with_sets
 from flowrec.stages.resolve import resolve
 from flowrec.store.session import Session
 from flowrec.verbs import session_replay as replay
-from flowrec.verbs.cli import main
+from tests.conftest import run
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
@@ -159,13 +158,8 @@ def test_a_recorded_setting_outside_of_its_range_may_stay_but_not_be_set() -> No
         (["replay", GOLDEN, "--set", "plan.speed_share=5"], "--set: plan.speed_share = 5: must be from 0.01 to 1"),
     ],
 )
-def test_the_flag_that_was_typed_is_named(
-    words: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+def test_the_flag_that_was_typed_is_named(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(words) == 2
     line = capsys.readouterr().err.strip()
     assert said in line
     nearest = {"astr": "astar_", "asimilate": "assimilate", "kalmann": "kalman", "polizy": "policy", "vektor": "vector"}

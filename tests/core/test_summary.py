@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,24 +13,21 @@ import pytest
 from flowrec.core.summary import Value, of_text, verdict_lines, way_text, with_micro
 from flowrec.store.reader import SessionReader
 from flowrec.store.session import Session
-from flowrec.verbs.cli import main
+from tests.conftest import run
 from tests.short_missions import SMALL
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
-    def run(*words: object) -> str:
+def told(capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    def printed(*words: object) -> str:
         """What a verb prints on stdout."""
-        monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
         capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert ended.value.code == 0
+        assert run(words) == 0
         return capsys.readouterr().out
 
-    return run
+    return printed
 
 
 def are_results_of_a_mission(facts: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ import pytest
 import xarray
 
 import flowrec
+from flowrec.core.errors import UsageError
 from flowrec.store.session import Session
 from tests.outlets import primes as p
 
@@ -156,14 +157,19 @@ def test_a_persons_table_without_deviations_counts_each_at_a_twentieth_of_the_us
     np.testing.assert_allclose(observations_of(table).std_um_s, 2.5)
 
 
-def test_zarr_has_images_and_fields_with_axes_in_um(exported: dict[str, Path]) -> None:
+def test_zarr_has_images_and_fields_with_axes_in_um(session: Session, exported: dict[str, Path]) -> None:
     with xarray.open_zarr(exported["zarr"]) as images:
         frames = images["frames"]
         assert frames.dims == ("time", "y_px", "x_px")
         assert frames.shape == (p.COUNT, p.HEIGHT_PX, p.WIDTH_PX)
         np.testing.assert_array_equal(frames[3], p.image(3))
         np.testing.assert_allclose(images["time_s"], 3.0 + 0.1 * np.arange(p.COUNT))
-        assert images["time_s"].attrs["unit"] == "s"
+        assert images["time_s"].attrs["units"] == "s"
+        row, column = 9, 51
+        here = images.sel(y_px=row, x_px=column)
+        chip_um = session.calibration.to_um((column, row))
+        np.testing.assert_allclose((here["x_um"], here["y_um"]), chip_um, rtol=1e-6)
+        assert images["x_um"].attrs["units"] == images["y_um"].attrs["units"] == "um"
         assert frames.attrs["bits"] == p.BITS
     with xarray.open_zarr(exported["zarr"], group="refined") as flow:
         check_dataset(flow)
@@ -171,6 +177,24 @@ def test_zarr_has_images_and_fields_with_axes_in_um(exported: dict[str, Path]) -
 
 def test_an_xarray_dataset_has_named_axes_and_units(session: Session) -> None:
     check_dataset(session.fields["refined"].to_xarray())
+
+
+def test_all_fields_are_one_dataset_that_is_selected_by_name_and_place_and_can_be_subtracted(session: Session) -> None:
+    fields = session.fields
+    data = fields.to_xarray()
+    assert data["field"].values.tolist() == list(fields)
+    assert data["method"].values.tolist() == [field.method for field in fields.values()]
+    assert data["time_s"].values.tolist() == [field.stamp_ns / 1e9 for field in fields.values()]
+    row, column = 9, 51
+    near_um = {"x_um": (column + 0.4) * p.UM_PER_PX, "y_um": (row - 0.4) * p.UM_PER_PX}
+    here = data.sel(field="refined").sel(near_um, method="nearest")
+    np.testing.assert_allclose(here["velocity_um_s"], at(row, column, p.REFINED_UM_S), rtol=1e-6)
+    change = data.sel(field="refined") - data.sel(field="assumed")
+    wanted = fields["refined"].velocity_um_s - fields["assumed"].velocity_um_s
+    np.testing.assert_array_equal(change["velocity_um_s"], wanted)
+    assert bool(np.isnan(data["std_um_s"].sel(field="assumed")).all()) == (fields["assumed"].std_um_s is None)
+    with pytest.raises(UsageError, match="no flow field"):
+        type(fields)().to_xarray()
 
 
 def check_dataset(flow: xarray.Dataset) -> None:
@@ -184,3 +208,5 @@ def check_dataset(flow: xarray.Dataset) -> None:
     assert flow["x_um"].attrs["units"] == flow["y_um"].attrs["units"] == "um"
     assert flow["velocity_um_s"].dims[:2] == ("y_um", "x_um")
     assert list(flow["component"].values) == ["x", "y"]
+    assert (flow["velocity_um_s"].attrs["long_name"], flow["x_um"].attrs["long_name"]) == ("flow velocity", "x")
+    assert bool(here["fluid"]) and not bool(flow["fluid"].values[0, 0])

@@ -28,7 +28,7 @@ from tests.rewritten import parser_of
 
 ROW, COLUMN = np.mgrid[: p.ROWS, : p.COLUMNS]
 FLUID = p.mask()
-M_PER_UM = 1e-6
+MM_PER_UM = 1e-3
 
 
 def speed_of(middle: tuple[float, float]) -> np.ndarray:
@@ -146,8 +146,8 @@ def foxglove(session: Session) -> dict[str, Any]:
     with session.path.open("rb") as file:
         reader = make_reader(file)
         for schema, channel, message in reader.iter_messages():
-            if channel.topic.startswith(("/view/", "/camera/frame/")):
-                assert schema is not None
+            assert schema is not None
+            if channel.topic.startswith(("/view/", "/camera/frame/")) and schema.encoding == "protobuf":
                 found[channel.topic] = parser_of(schema).FromString(message.data)
     return found
 
@@ -163,17 +163,19 @@ def test_the_camera_of_foxglove_sees_the_middle_of_the_image_in_its_middle(
     assert [camera.P[i] for i in (0, 2, 5, 6)] == [focal, cx, focal, cy]
     there = next(each for each in foxglove["/view/frames"].transforms if each.child_frame_id == camera.frame_id)
     middle_um = session.calibration.to_um((0.5 * p.WIDTH_PX - 0.5, 0.5 * p.HEIGHT_PX - 0.5))
-    np.testing.assert_allclose((there.translation.x, there.translation.y), M_PER_UM * np.asarray(middle_um))
+    np.testing.assert_allclose((there.translation.x, there.translation.y), MM_PER_UM * np.asarray(middle_um))
     # A pixel beside the middle is one pixel's size away on the chip, at the distance of the camera.
-    assert abs(there.translation.z) / focal == pytest.approx(M_PER_UM * p.CAMERA_UM_PER_PX)
+    assert abs(there.translation.z) / focal == pytest.approx(MM_PER_UM * p.CAMERA_UM_PER_PX)
 
 
-def test_places_of_foxglove_are_in_metres_and_numbers_in_the_units_of_their_names(foxglove: dict[str, Any]) -> None:
+def test_places_of_foxglove_are_in_millimetres_and_numbers_in_the_units_of_their_names(
+    foxglove: dict[str, Any],
+) -> None:
     here = p.position_um(23)
     pose = foxglove["/view/robot_pose"].pose.position
-    np.testing.assert_allclose((pose.x, pose.y, pose.z), (*(M_PER_UM * here), 0.0))
+    np.testing.assert_allclose((pose.x, pose.y, pose.z), (*(MM_PER_UM * here), 0.0))
     way = [(each.position.x, each.position.y) for each in foxglove["/view/path"].poses]
-    np.testing.assert_allclose(way, M_PER_UM * p.WAY_UM)
+    np.testing.assert_allclose(way, MM_PER_UM * p.WAY_UM)
     robot = foxglove["/view/robot_flow"]
     np.testing.assert_allclose((robot.x_um, robot.y_um, robot.flow_um_s), (*here, p.FLOW_SPEED_UM_S))
     assert robot.map_um_s == pytest.approx(speed_at(p.REFINED_UM_S, here), rel=1e-3)
@@ -183,11 +185,11 @@ def test_places_of_foxglove_are_in_metres_and_numbers_in_the_units_of_their_name
     assert (seen.std_um_s, seen.count) == (pytest.approx(2.2), 2)
 
 
-def test_the_flow_of_foxglove_is_a_grid_of_cells_in_metres(foxglove: dict[str, Any]) -> None:
+def test_the_flow_of_foxglove_is_a_grid_of_cells_in_millimetres(foxglove: dict[str, Any]) -> None:
     grid = foxglove["/view/flow_refined_grid"]
-    assert (grid.cell_size.x, grid.cell_size.y) == pytest.approx((M_PER_UM * p.UM_PER_PX,) * 2)
+    assert (grid.cell_size.x, grid.cell_size.y) == pytest.approx((MM_PER_UM * p.UM_PER_PX,) * 2)
     assert grid.column_count == p.COLUMNS
-    assert grid.pose.position.x == pytest.approx(-0.5 * M_PER_UM * p.UM_PER_PX)
+    assert grid.pose.position.x == pytest.approx(-0.5 * MM_PER_UM * p.UM_PER_PX)
     values = np.frombuffer(grid.data, "<f4").reshape(-1, p.COLUMNS, grid.cell_stride // 4)
     assert len(values) == p.ROWS
     names = [field.name for field in grid.fields]
@@ -195,6 +197,25 @@ def test_the_flow_of_foxglove_is_a_grid_of_cells_in_metres(foxglove: dict[str, A
     for name, wanted in zip(names, (*np.moveaxis(velocity, -1, 0), speed_of(p.REFINED_UM_S)), strict=True):
         np.testing.assert_allclose(values[..., names.index(name)][FLUID], wanted[FLUID], rtol=1e-3, err_msg=name)
     assert names == ["vx_um_s", "vy_um_s", "speed_um_s"]
+
+
+def test_rerun_makes_views_of_the_bare_file_by_itself_for_verdict_numbers_and_a_chip_some_units_wide(
+    session: Session,
+) -> None:
+    from rerun.chunk import McapReader
+
+    found: dict[str, dict[str, Any]] = {}
+    for chunk in McapReader(session.path).stream().to_chunks():
+        columns = chunk.to_record_batch()
+        found.setdefault(str(chunk.entity_path), {}).update(zip(columns.schema.names, columns.columns, strict=True))
+    (text,) = found["/verdict"]["TextDocument:text"].to_pylist()[0]
+    assert text.startswith(f"{session.outcome['outcome']}\n\n") and "69 µm/s (yellow)" in text
+    errors = [number for (number,) in found["/view/tracking_error_um"]["Scalars:scalars"].to_pylist()]
+    assert errors[-1] == p.ERROR_UM
+    (speed,) = found["/view/flow_at_robot_um_s"]["Scalars:scalars"].to_pylist()[-1]
+    assert speed == pytest.approx(p.FLOW_SPEED_UM_S)
+    way = np.array(found["/camera/frame/path"]["Points3D:positions"].to_pylist()[-1])
+    assert 0.1 < np.ptp(way, axis=0).max() < 100.0  # its 3-D view looks past what is some thousandths wide
 
 
 def test_foxglove_looks_at_the_chip_from_where_the_camera_is(foxglove: dict[str, Any]) -> None:

@@ -22,10 +22,9 @@ from flowrec.run.watchdog import Watchdog
 from flowrec.stages.config import load_config
 from flowrec.store.reader import SessionReader
 from flowrec.verbs import record as verb
-from flowrec.verbs.cli import main
 from flowrec.verbs.replay_change import Change
 from flowrec.verbs.session_replay import replay_session
-from tests.conftest import until
+from tests.conftest import run, until
 from tests.perf.stop_trial import LoggedRig
 from tests.perf.stops import KINDS, Ended, Kind, stop
 from tests.short_missions import SMALL
@@ -254,14 +253,11 @@ def test_record_as_a_function_leaves_signals_alone_and_zeroes_on_ctrl_c(
 
 
 def test_a_guard_shorter_than_the_frames_is_refused_before_anything_is_driven(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["flowrec", "record", "--realtime", "--out", str(tmp_path / "x.mcap")]
+    words = ["record", "--realtime", "--out", str(tmp_path / "x.mcap")]
     words += ["--set", "camera.rate_hz=60", "--set", "safety.guard_timeout_s=0.04"]
-    monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+    assert run(words) == 2
     assert (
         "safety.guard_timeout_s = 0.04: shorter than 3 frames at camera.rate_hz = 60; the nearest that works is 0.05"
         in capsys.readouterr().err

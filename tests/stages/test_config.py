@@ -6,7 +6,6 @@ import ast
 import json
 import math
 import re
-import sys
 import tomllib
 from dataclasses import asdict, fields, is_dataclass, replace
 from functools import reduce
@@ -26,9 +25,9 @@ from flowrec.stages.config import _BEFORE, _MOVED, Config, config_from_toml, loa
 from flowrec.stages.resolve import resolve
 from flowrec.stages.rig_settings import RIGS
 from flowrec.store.reader import SessionReader
-from flowrec.verbs.cli import main
 from flowrec.verbs.preparation import prepare
 from flowrec.verbs.run_summary import Recorded
+from tests.conftest import run
 
 
 def test_a_configuration_survives_its_own_toml() -> None:
@@ -149,12 +148,8 @@ def test_every_key_that_the_readme_names_exists() -> None:
     assert named - known - files == set()
 
 
-def run_main(words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    monkeypatch.setattr(sys, "argv", ["flowrec", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert isinstance(ended.value.code, int)
-    return ended.value.code, capsys.readouterr().err.strip().splitlines()[-1]
+def last_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    return run(words), capsys.readouterr().err.strip().splitlines()[-1]
 
 
 @pytest.mark.parametrize(
@@ -162,10 +157,10 @@ def run_main(words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     [["chip.inlet_speed_um_s=60000"], ["robot.max_speed_um_s=600", "chip.inlet_speed_um_s=3000"]],
 )
 def test_a_goal_that_is_found_unreachable_before_the_run_fails_as_one_found_during_it(
-    swift: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    swift: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [word for setting in swift for word in ("--set", setting)]
-    status, line = run_main(["record", "--dry-run", *words], monkeypatch, capsys)
+    status, line = last_line(["record", "--dry-run", *words], capsys)
     assert (status, line[:22]) == (1, "flowrec: unreachable: ")
 
 
@@ -194,9 +189,9 @@ def test_the_configuration_of_the_folder_is_used_where_none_is_named(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "flowrec.toml").write_text('[plan]\nmethod = "astr"\n', encoding="utf-8")
     (tmp_path / "other.toml").write_text("[plan]\nspeed_share = 7.0\n", encoding="utf-8")
-    status, line = run_main(["record", "--dry-run"], monkeypatch, capsys)
+    status, line = last_line(["record", "--dry-run"], capsys)
     assert status == 2 and line.startswith("flowrec: flowrec.toml: plan.method = 'astr'")
-    status, line = run_main(["record", "other.toml", "--dry-run"], monkeypatch, capsys)
+    status, line = last_line(["record", "other.toml", "--dry-run"], capsys)
     assert status == 2 and line.startswith("flowrec: other.toml: plan.speed_share = 7")
 
 
@@ -238,17 +233,13 @@ def test_a_limit_that_the_method_of_the_survey_does_not_read_is_refused_with_tho
     resolve(with_sets(config, ["survey.method=downstream"]), load_chip(config.chip))
 
 
-def test_what_was_derived_is_said_and_kept_in_the_file(
-    mission: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_derived_is_said_and_kept_in_the_file(mission: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
     kept = json.loads(SessionReader(mission.path).header.provenance.get("derived", "{}"))
     assert kept.get("robot.max_speed_um_s") == 600.0
     assert kept["robot.radius_um"] == 60.0  # three of its pixels
     assert kept == dict(mission.derived)
     assert "robot.um_per_rev" not in kept
-    monkeypatch.setattr(sys, "argv", ["flowrec", "record", "--dry-run", "--set", "robot.radius_um=50"])
-    with pytest.raises(SystemExit):
-        main()
+    assert run(["record", "--dry-run", "--set", "robot.radius_um=50"]) == 0
     said = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("derived"))
     assert "robot.max_speed_um_s = 600" in said
     assert "robot.radius_um" not in said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,14 @@ def test_the_meaning_of_a_setting_is_the_comment_at_its_own_declaration() -> Non
     assert ROWS["plan.idle_speed_um_s"].meaning.startswith("swimming at this speed takes as much power")
     assert (ROWS["robot.delay_s"].unit, ROWS["robot.delay_s"].valid) == ("s", "number from 0 to 10")
     assert ROWS["plan.policy_share"].read_by == ("time_field",) and ROWS["plan.speed_share"].read_by == ()
+
+
+def test_a_value_that_is_not_there_has_one_name_for_people() -> None:
+    assert ROWS["plan.idle_speed_um_s"].meaning.endswith("as everything else; not set: half of V")
+    assert ROWS["recording.split_s"].meaning.endswith("the next one begins. Not set: one file")
+    assert ROWS["plan.idle_speed_um_s"].lines()[0] == "plan.idle_speed_um_s = (not set)"
+    told = "\n".join([*(line for row in ROWS.values() for line in row.lines()), *settings().values()])
+    assert "None" not in told
 
 
 @pytest.mark.parametrize("changed_only", [False, True])
@@ -57,3 +66,11 @@ def test_a_misspelt_setting_is_answered_with_the_nearest() -> None:
         settings("speed_share")
     with pytest.raises(UsageError, match="did you mean mission"):
         settings("mision")
+    # One of another section and a misspelt one: the same answer wherever it is given.
+    for wrong, right in (("recording.goal", "mission.goal"), ("plan.sped_share", "plan.speed_share")):
+        with pytest.raises(UsageError) as used:
+            load_config(None, [f"{wrong}=1"])
+        with pytest.raises(UsageError) as asked:
+            settings(wrong)
+        hint = re.search(r"did you mean [^?]*", str(used.value))
+        assert hint is not None and right in hint[0] and hint[0] in str(asked.value)

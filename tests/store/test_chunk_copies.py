@@ -141,10 +141,14 @@ def test_drawings_follow_all_that_was_recorded_and_are_those_of_its_ticks(files)
     assert chunks_of(files["delta"], drawn=True)[0][0] > chunks_of(files["delta"])[-1][0]
     views, expected = ViewerTopics(ViewerScene(None, START_UNIX_NS)), {}
     with FileReader(files["delta"]) as file:
+        first_ns, _ = next(iter(file.new_messages(None, set(file.fields.values()))))
         for log_ns, messages in file.new_messages(None, set(file.fields.values())):
             for topic, stamp_ns, payload in views.of(messages):
                 times = log_ns + START_UNIX_NS, stamp_ns + START_UNIX_NS
                 expected.setdefault(SLOTS[topic].channel, []).append((times, b"".join(payload)))
+        for topic, stamp_ns, payload in views.of_end({"outcome": "ended"}, first_ns):
+            times = START_UNIX_NS + stamp_ns, START_UNIX_NS + stamp_ns
+            expected[SLOTS[topic].channel] = [(times, b"".join(payload))]
     found = drawn_of(files["delta"])
     assert {n: [(tuple(head[1:]), payload) for head, payload in each] for n, each in found.items()} == expected
 
@@ -163,7 +167,9 @@ def test_an_image_that_makes_no_sense_under_a_right_checksum_is_left_out_alone(f
     assert "1 messages that make no sense, the first is /camera/frame" in done.lost and "1 images" in done.lost
     (lost,) = [image for image in before[FRAMES] if b"mono9" in image[1]]
     before[FRAMES].remove(lost)
-    assert messages_of(done.path) == before and not recover(done.path).changed
+    after, verdict = messages_of(done.path), SLOTS["/verdict"].channel
+    assert b"ended" in before.pop(verdict)[0][1] and b"cut\n\nrecovered" in after.pop(verdict)[0][1]
+    assert after == before and not recover(done.path).changed
 
 
 def test_a_chunk_without_a_checksum_gets_one(files, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
@@ -21,8 +20,8 @@ from flowrec.store.object_requests import _redirect_target
 from flowrec.store.run_files import session_sha256
 from flowrec.store.session_path import UrlPath, session_path
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError
-from flowrec.verbs.cli import app, main
-from tests.conftest import HANG_S
+from flowrec.verbs.cli import app
+from tests.conftest import HANG_S, run
 from tests.extras import needs
 from tests.store.range_server import RangeServer, answer, served, some, status
 from tests.store.s3_server import BUCKET, KEYS, s3_server
@@ -155,15 +154,11 @@ def test_a_server_that_takes_the_last_bytes_for_the_first_is_asked_for_them_by_n
     assert flowrec.open(url).last.track.same_as(flowrec.open(session).last.track) and TRAFFIC.repeated == before
 
 
-def test_a_verb_says_which_requests_it_has_repeated(
-    server: RangeServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["flowrec", "info", server.url, "--json"])
+def test_a_verb_says_which_requests_it_has_repeated(server: RangeServer, capsys: pytest.CaptureFixture[str]) -> None:
     server.fault = some(FAULTS["broken"][0], after=0, count=3)
-    with pytest.raises(SystemExit) as ended:
-        main()
+    assert run(["info", server.url, "--json"]) == 0
     printed = capsys.readouterr()
-    assert not ended.value.code and json.loads(printed.out)["session"] == server.url
+    assert json.loads(printed.out)["session"] == server.url
     assert printed.err.splitlines() == ["3 requests were repeated: the server answers 500 (3)"]
 
 

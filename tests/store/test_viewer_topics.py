@@ -1,14 +1,17 @@
 """Views for other programs."""
 
 import dataclasses
+import math
+import struct
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from flowrec.core.declarations import as_read
-from flowrec.core.messages import Estimate, Mission, Observations, Route, Track
+from flowrec.core.messages import Demand, Estimate, Mission, Observations, Route, Track
 from flowrec.physics.chip.registration import Calibration, on_chip
 from flowrec.physics.flow.sampling import sample
 from flowrec.store.roi import nonzero_window, region_from
@@ -25,7 +28,11 @@ START_NS = 1_790_000_000_000_000_000
 
 
 def parsed(path, payload):
-    return _SCHEMAS[path].wire.FromString(b"".join(payload))
+    """A message of protobuf, or the number or text of one of ROS 2."""
+    data = b"".join(payload)
+    if _SCHEMAS[path].wire is not None:
+        return _SCHEMAS[path].wire.FromString(data)
+    return struct.unpack_from("<d", data, 20)[0] if "Float64" in _SCHEMAS[path].name else data[8:-1].decode()
 
 
 def seen(views, messages):
@@ -40,7 +47,7 @@ def turned(q, vector):
 
 
 def projected(found, place, camera="/view/camera"):
-    """The pixel of a place in the chip's frame in m, by the transform and the calibration of a camera alone."""
+    """The pixel of a place in the chip's frame in mm, by the transform and the calibration of a camera alone."""
     calibration = found[camera]
     there = next(each for each in found["/view/frames"].transforms if each.child_frame_id == calibration.frame_id)
     assert there.parent_frame_id == "chip"
@@ -77,7 +84,7 @@ def test_robot_route_and_goal_lie_on_the_image_where_the_tracker_saw_them(angle_
         ring, (way, cross) = found["/view/robot_mark"].circles[0], found["/view/route_mark"].points
         pairs = [
             (robot_px, ring.position, found["/view/robot_pose"].pose.position),
-            (goal_px, found["/view/route_mark"].circles[0].position, [*(1e-6 * goal_um), 0.0]),
+            (goal_px, found["/view/route_mark"].circles[0].position, [*(1e-3 * goal_um), 0.0]),
             (way_px[0], way.points[0], found["/view/path"].poses[0].position),
             (way_px[1], way.points[-1], found["/view/path"].poses[-1].position),
         ]
@@ -90,9 +97,9 @@ def test_robot_route_and_goal_lie_on_the_image_where_the_tracker_saw_them(angle_
         assert np.isclose(ring.diameter * stated.um_per_px, 3.0 * 70.0, rtol=0.02) and len(cross.points) == 4
         assert ring.timestamp.ToNanoseconds() == way.timestamp.ToNanoseconds() == START_NS + now
         place = point(found["/view/robot_pose"].pose.position)
-        assert np.allclose(projected(found, place, "/view/map"), 1e6 * place[:2] / field.um_per_px + 0.5, atol=1e-3)
+        assert np.allclose(projected(found, place, "/view/map"), 1e3 * place[:2] / field.um_per_px + 0.5, atol=1e-3)
         (points,) = (found[f"/camera/frame/{name}"] for name in ("path",))
-        assert np.allclose(np.frombuffer(points.data, "<f4").reshape(-1, 4)[:, :2], 1e-6 * way_um, rtol=1e-6)
+        assert np.allclose(np.frombuffer(points.data, "<f4").reshape(-1, 4)[:, :2], 1e-3 * way_um, rtol=1e-6)
 
 
 def test_what_did_not_move_is_drawn_once_and_a_robot_out_of_sight_is_pale():
@@ -106,7 +113,8 @@ def test_what_did_not_move_is_drawn_once_and_a_robot_out_of_sight_is_pale():
     again = seen(
         views, {"track": replace(track, stamp_ns=late, seen=False), "mission": replace(mission, stamp_ns=late)}
     )
-    assert again.keys() == {"/view/robot_pose", "/camera/frame/robot", "/view/robot_mark", "/view/robot_flow"}
+    numbers = {"/view/robot_flow", "/view/flow_at_robot_um_s", "/view/flow_difference_um_s"}
+    assert again.keys() == {"/view/robot_pose", "/camera/frame/robot", "/view/robot_mark", *numbers}
     colours = [each["/view/robot_mark"].circles[0].outline_color for each in (first, again)]
     assert colours[0].b < colours[0].r == 1.0 and colours[1].r == colours[1].b
     gone = seen(views, {"mission": replace(mission, stamp_ns=late, goal_um=np.full(2, np.nan))})
@@ -127,11 +135,41 @@ def test_plotted_numbers_are_those_of_the_observer_and_of_the_map_where_the_robo
         assert (numbers.x_um, numbers.y_um, numbers.flow_um_s) == (30.0, 25.0, 5.0)
         assert np.isclose(numbers.map_um_s, np.hypot(*on_map), rtol=1e-6)
         assert np.isclose(numbers.difference_um_s, np.hypot(*(flow - on_map)), rtol=1e-6)
+    assert found["/view/flow_at_robot_um_s"] == 5.0
+    assert np.isclose(found["/view/flow_difference_um_s"], np.hypot(*(flow - on_map)), rtol=1e-12)
     assert (found["/view/robot_flow"].map_error_share, found["/view/observation"].std_um_s) == (0.25, 2.0)
     along = found["/view/route_flow"]
     there = sample(field, route.waypoints_um)
     assert list(along.distance_um) == [0.0, 20.0] and list(along.std_um_s) == [3.0, 3.0]
     assert np.allclose(along.along_um_s, there[:, 1], rtol=1e-6) and np.allclose(along.map_um_s, np.hypot(*there.T))
+
+
+def test_rerun_gets_no_view_that_stays_empty():
+    fluid = np.zeros((24, 32), "<f4")
+    fluid[5:9, 3:30] = 1.0  # rows 5 to 8, columns 3 to 29
+    flow = dataclasses.replace(field_of(1, np.random.default_rng(2)), wall_px=fluid)
+    demand = Demand(5, np.zeros(2), np.zeros(2), 0.0, math.nan, False, np.zeros((0, 2)))
+    views = ViewerTopics()
+    first = seen(views, {"assumed": flow, "demand": demand})
+    points = np.frombuffer(first["/view/walls"].data, "<f4").reshape(-1, 4)[:, :2]
+    edges = [(3, 5), (29, 8)] * np.array(1e-3 * flow.um_per_px)
+    assert np.allclose((points.min(axis=0), points.max(axis=0)), edges, rtol=1e-6) and len(points) == 2 * (26 + 3)
+    assert "/view/tracking_error_um" not in first, "a line of NaN"
+    found = [seen(views, {"demand": replace(demand, error_um=error)}) for error in (3.0, math.nan)]
+    assert found[0]["/view/tracking_error_um"] == 3.0 and math.isnan(found[1]["/view/tracking_error_um"])
+    later = seen(views, {"refined": flow})
+    at_once = [path for path, _, _ in ViewerTopics().of({"assumed": flow, "refined": flow})]
+    assert at_once.count("/view/flow_refined") == 1
+    pictures = [
+        cv2.imdecode(np.frombuffer(each["/view/flow_refined"].data, np.uint8), cv2.IMREAD_COLOR)
+        for each in (first, later)
+    ]
+    assert [picture.shape for picture in pictures] == [(24, 32, 3)] * 2 and first[
+        "/view/flow_refined"
+    ].frame_id == "map"
+    grey = [(picture == picture[..., :1]).all() for picture in pictures]
+    assert grey == [True, False] and pictures[0].any(), "words first, then the flow in colours"
+    assert "/view/flow_refined_grid" not in first
 
 
 def test_the_robot_is_where_it_is_when_protobuf_reads_its_views():
@@ -140,7 +178,7 @@ def test_the_robot_is_where_it_is_when_protobuf_reads_its_views():
         found = seen(ViewerTopics(), {"estimate": here})
         for path in ("/view/robot_pose", "/camera/frame/robot"):
             place = found[path].pose.position
-            assert np.allclose((place.x, place.y, place.z), (1e-6 * x_um, 1e-6 * y_um, 0.0), rtol=1e-12)
+            assert np.allclose((place.x, place.y, place.z), (1e-3 * x_um, 1e-3 * y_um, 0.0), rtol=1e-12)
             assert (found[path].pose.orientation.w, found[path].frame_id) == (1.0, "chip")
             assert found[path].timestamp.seconds * 10**9 + found[path].timestamp.nanos == stamp_ns
 
@@ -168,7 +206,7 @@ def in_file(path):
     with path.open("rb") as stream:
         reader = make_reader(stream)
         return [
-            (channel.topic, message.log_time, _SCHEMAS[channel.topic].wire.FromString(message.data))
+            (channel.topic, message.log_time, parsed(channel.topic, (message.data,)))
             for _, channel, message in reader.iter_messages()
             if channel.topic in _SCHEMAS
         ]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import sys
 import tomllib
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -18,7 +17,7 @@ import flowrec
 from flowrec.core.errors import UsageError
 from flowrec.measure.calibrate_motion import calibrate_motion
 from flowrec.stages.config import load_config
-from flowrec.verbs.cli import main
+from tests.conftest import run
 from tests.movies import makers
 
 MOVIE = Path(__file__).parents[2] / "sessions" / "movie"
@@ -86,25 +85,18 @@ def test_calibrate_motion_finds_an_imported_session_aligned(imported: Path) -> N
     assert motion.sets["robot.um_per_rev"] == pytest.approx(25.0, rel=0.05)
 
 
-def at_the_command_line(words: list[object], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", ["flowrec", "calibrate", "motion", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
 @pytest.mark.slow("aligns a whole movie by its motion")
 def test_calibrate_motion_at_the_command_line_takes_another_log_on_another_clock(
-    imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    imported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, out = late_log(tmp_path / "later.csv", 700.0), tmp_path / "motion.toml"
-    assert at_the_command_line([imported, "--coils", log, "--out", out, "--json"], monkeypatch) == 0
+    assert run(["calibrate", "motion", imported, "--coils", log, "--out", out, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     delay_s = flowrec.open(imported).config.robot.delay_s
     assert found["offset_s"] == pytest.approx(CLOCK_OFFSET_S + 700.0 - delay_s, abs=4e-3)
     assert f"robot.um_per_rev={tomllib.loads(out.read_text())['robot']['um_per_rev']}" in found["set"]
     foreign = late_log(tmp_path / "foreign.csv", 0.0, heading=3.0)
-    assert at_the_command_line([imported, "--coils", foreign, "--out", tmp_path / "b.toml"], monkeypatch) == 2
+    assert run(["calibrate", "motion", imported, "--coils", foreign, "--out", tmp_path / "b.toml"]) == 2
     refused = capsys.readouterr().err
     assert "the log explains" in refused and refused.count("\n") == 1 and not (tmp_path / "b.toml").exists()
 

@@ -9,28 +9,21 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from unittest import mock
 
 import cv2
 import numpy as np
 import pytest
 
-from flowrec.verbs.cli import main, with_default_refine
-from tests.conftest import HANG_S, until
+from flowrec.verbs.cli import with_default_refine
+from tests.conftest import HANG_S, run, until
 from tests.short_missions import LONG
 
 
 def flowrec(*words: object) -> subprocess.CompletedProcess[str]:
-    """The command in this process, because to start another one takes longer than most commands."""
-    out, err = io.StringIO(), io.StringIO()
-    with (
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        mock.patch("sys.argv", ["flowrec", *map(str, words)]),
-        pytest.raises(SystemExit) as ended,
-    ):
-        main()
-    return subprocess.CompletedProcess(words, int(ended.value.code or 0), out.getvalue(), err.getvalue())
+    """The command in this process, and what it prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        status = run(words)
+    return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
 
 
 def one_line_error(done: subprocess.CompletedProcess[str], status: int, *words: str) -> None:

@@ -18,16 +18,10 @@ from typer.testing import CliRunner
 
 from flowrec.bench import plan
 from flowrec.core import REPLAYED, terminal
-from flowrec.verbs.cli import app, main, with_default_refine
+from flowrec.verbs.cli import app, with_default_refine
+from tests.conftest import run
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
-
-
-def run(words: list[object], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
 
 
 def test_a_bench_prints_its_figures_as_json_like_every_other_verb(
@@ -35,7 +29,7 @@ def test_a_bench_prints_its_figures_as_json_like_every_other_verb(
 ) -> None:
     kept = tmp_path / "figures.json"
     monkeypatch.setattr("flowrec.bench.solver.measure", lambda: {"rows": [1]})
-    assert run(["bench", "solver", "--json", "--out", kept], monkeypatch) == 0
+    assert run(["bench", "solver", "--json", "--out", kept]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["rows"] == [1]
     assert printed["machine"]["cores"]
@@ -70,9 +64,9 @@ def test_the_help_of_replay_and_export_names_every_method_of_every_table() -> No
     ],
 )
 def test_wrong_usage_is_told_in_one_line_that_names_the_help(
-    words: list[object], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[object], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(words, monkeypatch) == 2
+    assert run(words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("flowrec: ")
     assert said in line
@@ -96,10 +90,10 @@ def test_the_help_of_every_verb_ends_with_examples_that_can_be_typed(
             verb.make_context(name, with_default_refine(words))
 
 
-def test_the_goal_of_an_example_can_be_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_goal_of_an_example_can_be_reached() -> None:
     examples = get_command(app).commands["record"].epilog.split("\n\n")  # type: ignore[attr-defined]
     (example,) = [shlex.split(each) for each in examples if "--goal" in each]
-    assert run([*example[1:], "--dry-run"], monkeypatch) == 0
+    assert run([*example[1:], "--dry-run"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -128,27 +122,25 @@ def test_calibrate_prints_where_the_encoding_has_no_plus_minus_sign(monkeypatch:
     printed = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
     monkeypatch.setattr(sys, "stdout", printed)
     try:
-        assert run(["calibrate", "coils", SESSIONS / "coils.csv"], monkeypatch) == 0
+        assert run(["calibrate", "coils", SESSIONS / "coils.csv"]) == 0
     except UnicodeEncodeError as error:
         pytest.fail(str(error))
     assert b"b_x" in printed.buffer.getvalue()  # type: ignore[attr-defined]
 
 
 def test_a_table_given_to_calibrate_itself_is_fitted_and_the_new_command_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert run(["calibrate", SESSIONS / "coils.csv", "--json"], monkeypatch) == 0
+    assert run(["calibrate", SESSIONS / "coils.csv", "--json"]) == 0
     said = capsys.readouterr()
     assert said.err.splitlines() == ["flowrec calibrate TABLE is now flowrec calibrate coils TABLE"]
     assert '"mt_per_a"' in said.out
-    assert run(["calibrate", "coil", SESSIONS / "coils.csv"], monkeypatch) == 2
+    assert run(["calibrate", "coil", SESSIONS / "coils.csv"]) == 2
     assert "coil" in capsys.readouterr().err
 
 
-def test_a_chip_given_as_a_configuration_is_told_apart(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["record", "--dry-run", SESSIONS / "chips" / "y_junction.toml"], monkeypatch) == 2
+def test_a_chip_given_as_a_configuration_is_told_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["record", "--dry-run", SESSIONS / "chips" / "y_junction.toml"]) == 2
     said = capsys.readouterr().err
     assert "describes a chip" in said
     assert "--set chip.path=" in said
@@ -156,21 +148,16 @@ def test_a_chip_given_as_a_configuration_is_told_apart(
 
 @pytest.mark.parametrize(("name", "said"), [("own.yaml", "is YAML by its name"), ("run.mcap", "is a session")])
 def test_a_configuration_that_is_no_toml_is_told_apart(
-    name: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / name).write_text("chip:\n  name: straight\n")
-    assert run(["record", "--dry-run", tmp_path / name], monkeypatch) == 2
+    assert run(["record", "--dry-run", tmp_path / name]) == 2
     assert said in capsys.readouterr().err
 
 
-def test_a_byte_order_mark_is_no_part_of_a_configuration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_byte_order_mark_is_no_part_of_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "own.toml").write_bytes(b"\xef\xbb\xbf[chip]\nname = 'straight'\n")
-    monkeypatch.setattr(sys, "argv", ["flowrec", "record", "--dry-run", str(tmp_path / "own.toml")])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 0
+    assert run(["record", "--dry-run", tmp_path / "own.toml"]) == 0
     assert 'name = "straight"' in capsys.readouterr().out
 
 
@@ -191,10 +178,10 @@ def test_planners_that_are_not_installed_are_left_out_and_named(
 
 @pytest.mark.slow("replays a mission and fits a network")
 def test_a_refinement_that_changes_nothing_says_why(
-    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "again.mcap"
-    assert run(["replay", session, "--refine", "--out", out], monkeypatch) == 0
+    assert run(["replay", session, "--refine", "--out", out]) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "the refined map is the recorded one, unchanged" in said
     assert "--set refine.pi_unet.start=fvm" in said
@@ -208,20 +195,18 @@ def test_a_bar_that_stands_names_no_time_left() -> None:
 
 
 @pytest.mark.slow("replays a session four times")
-def test_a_replay_states_the_path_of_its_session(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_replay_states_the_path_of_its_session(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = tmp_path / "again.mcap"
-    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--json"], monkeypatch) == 0
+    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["out"] == str(out)
-    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--overwrite"], monkeypatch) == 0
+    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--overwrite"]) == 0
     assert "".join(capsys.readouterr().err.split()).find(f"->{out}") > 0
     beside = tmp_path / "golden.mcap"
     shutil.copy(SESSIONS / "golden.mcap", beside)
-    assert run(["replay", beside, "--json"], monkeypatch) == 0
+    assert run(["replay", beside, "--json"]) == 0
     made = tmp_path / "golden_replay_001.mcap"
     assert json.loads(capsys.readouterr().out)["out"] == str(made) and made.is_file()
-    assert run(["replay", beside, "--verify"], monkeypatch) == 3  # other numerics
+    assert run(["replay", beside, "--verify"]) == 3  # other numerics
     assert len(list(tmp_path.glob("golden_replay*"))) == 1
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import cv2
@@ -16,10 +15,10 @@ from flowrec.physics.chip.io import chip_files
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.config import Config, load_config, to_toml
 from flowrec.stages.control.field_log import FieldLog
-from flowrec.verbs.cli import main
 from flowrec.verbs.first_pass import MovieTracks
 from flowrec.verbs.misfit import trembling as trembling_um
 from flowrec.verbs.misfit import why_unexplained
+from tests.conftest import run
 from tests.movies import makers
 from tests.stages.vision.shaky import ROBOT, UM_PER_PX, WIDTH, chip, image
 
@@ -48,13 +47,6 @@ def movie(folder: Path, places: list[list[tuple[float, float]]], shake_px: float
     return makers.folder(folder / "movie", pictures)
 
 
-def run(words: list[object], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
 def first_place_px(session: Path) -> np.ndarray:
     track = next(track for track in flowrec.open(session).messages("track") if track.seen)
     return np.asarray(flowrec.open(session).calibration.to_px(track.position_um))
@@ -62,13 +54,13 @@ def first_place_px(session: Path) -> np.ndarray:
 
 @pytest.mark.slow("imports a movie four times")
 def test_two_bodies_alike_are_refused_with_a_picture_and_each_way_to_name_one_takes_it(
-    known: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    known: Config, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made, toml = movie(tmp_path, PAIR), tmp_path / "my.toml"
     toml.write_text(to_toml(known), encoding="utf-8")
     words = ["import", made, toml, "-o", tmp_path / "a.mcap", "--overwrite"]
     (tmp_path / "movie_robots.png").write_bytes(b"of somebody else")
-    assert run(words, monkeypatch) == 2
+    assert run(words) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert "2 bodies in image 0 look like the robot" in said and "movie_robots_2.png" in said and "--robot N" in said
     assert (tmp_path / "movie_robots.png").read_bytes() == b"of somebody else"
@@ -79,14 +71,14 @@ def test_two_bodies_alike_are_refused_with_a_picture_and_each_way_to_name_one_ta
         near = np.hypot(*(amber[:, ::-1] / factor - at).T)
         assert (near < 16.0).sum() > 40
     assert not (tmp_path / "a.mcap").exists()
-    assert run(words, monkeypatch) == 2 and not (tmp_path / "movie_robots_3.png").exists()  # the same picture
+    assert run(words) == 2 and not (tmp_path / "movie_robots_3.png").exists()  # the same picture
     um = UM_PER_PX * np.array(PAIR[0][1])
     for which, place in (("1", 0), ("2", 1), ("60,90px", 1), (f"{um[0]:g},{um[1]:g}", 1)):
-        assert run([*words, "--robot", which], monkeypatch) == 0
+        assert run([*words, "--robot", which]) == 0
         assert np.hypot(*(first_place_px(tmp_path / "a.mcap") - PAIR[0][place])) < 1.0
     capsys.readouterr()
     for which, said in (("3", "there are 2"), ("a,b", "neither a number"), ("900,90px", "outside of the image")):
-        assert run([*words, "--robot", which], monkeypatch) == 2
+        assert run([*words, "--robot", which]) == 2
         assert said in capsys.readouterr().err
 
 
@@ -124,10 +116,10 @@ def test_a_doubtful_track_makes_the_session_doubtful_wherever_it_is_shown(
     jumps = [[(40.0 + 1.5 * n + 60.0 * (n >= 12), 80.0)] for n in range(COUNT)]
     made, toml, out = movie(tmp_path, jumps), tmp_path / "my.toml", tmp_path / "a.mcap"
     toml.write_text(to_toml(known), encoding="utf-8")
-    assert run(["import", made, toml, "-o", out], monkeypatch) == 3
+    assert run(["import", made, toml, "-o", out]) == 3
     assert "doubtful: the track jumps once" in capsys.readouterr().err
     assert "jumps once" in flowrec.info(out)["doubts"]
-    assert run(["ls", tmp_path], monkeypatch) == 0
+    assert run(["ls", tmp_path]) == 0
     assert "observe complete, doubtful" in " ".join(capsys.readouterr().out.replace("│", " ").split())
     verdict = flowrec.check(out)
     assert verdict.exit_status == 3
@@ -138,7 +130,7 @@ def test_a_doubtful_track_makes_the_session_doubtful_wherever_it_is_shown(
     page = flowrec.report(out).read_text(encoding="utf-8")
     assert 'class="outcome doubtful"' in page and "the track jumps once" in page
     again = tmp_path / "again.mcap"
-    assert run(["replay", out, "--out", again, "--json"], monkeypatch) == 3
+    assert run(["replay", out, "--out", again, "--json"]) == 3
     assert "jumps once" in json.loads(capsys.readouterr().out)["doubts"] and flowrec.info(again)["doubts"]
 
 

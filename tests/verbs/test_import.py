@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from flowrec.core.errors import FlowrecError, MovieError, UsageError
 from flowrec.physics.chip.io import chip_files
 from flowrec.physics.flow.sampling import relative_rmse
 from flowrec.stages.config import Config, load_config
-from flowrec.verbs.cli import main
+from tests.conftest import run
 from tests.movies import makers
 
 SHORT = 75
@@ -79,13 +78,6 @@ def lab(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
     makers.video(folder / "film.avi", "mjpeg", images, made.rate_hz)
     makers.video(folder / "short.avi", "mjpeg", images[:SHORT], made.rate_hz)  # where the flow is not looked at
     return made
-
-
-def run(words: list[object], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -293,17 +285,17 @@ def test_bad_input_is_one_line_and_leaves_what_was_there(kind: str, lab: Laborat
 
 @pytest.mark.slow("imports a whole movie twice")
 def test_a_movie_that_breaks_off_is_taken_as_far_as_it_goes_if_that_is_said(
-    lab: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    lab: Laboratory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = (lab.folder / "film.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
     toml = tmp_path / "my.toml"
     toml.write_text(flowrec.stages.config.to_toml(lab.config), encoding="utf-8")
     words = ["import", tmp_path / "cut.avi", toml, "-o", tmp_path / "cut.mcap", "--coils", lab.log, "--no-align"]
-    assert run(words, monkeypatch) == 2
+    assert run(words) == 2
     refused = capsys.readouterr().err.strip().splitlines()
     assert len(refused) == 1 and "breaks off" in refused[0]
-    assert run([*words, "--partial", "--json"], monkeypatch) == 3  # so short a motion does not confirm the log's axes
+    assert run([*words, "--partial", "--json"]) == 3  # so short a motion does not confirm the log's axes
     found = json.loads(capsys.readouterr().out)
     assert found["outcome"] == "observe complete" and "the axes of the log are not confirmed" in found["doubts"]
     frames = list(flowrec.open(tmp_path / "cut.mcap").frames)

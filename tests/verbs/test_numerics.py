@@ -13,16 +13,13 @@ import flowrec
 from flowrec.core.provenance import provenance
 from flowrec.core.version import NUMERICS_VERSION
 from flowrec.stages.estimation.kalman import Kalman
-from flowrec.verbs.cli import main
+from tests.conftest import run
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
 
-def run(words: list[object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0), capsys.readouterr().out
+def told(words: list[object], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    return run(words), capsys.readouterr().out
 
 
 @pytest.fixture
@@ -48,29 +45,27 @@ def test_a_new_session_states_its_numerics_and_the_first_release_is_version_1(se
 
 @pytest.mark.slow("verifies a session by other numerics several times")
 @pytest.mark.usefixtures("other_numerics")
-def test_a_verification_by_other_numerics_says_so_instead_of_different(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
+def test_a_verification_by_other_numerics_says_so_instead_of_different(capsys: pytest.CaptureFixture[str]) -> None:
+    status, said = told(["replay", GOLDEN, "--verify"], capsys)
     assert status == 3
     assert (
         f"made by other numerics (recorded: version 1, replayed: version {NUMERICS_VERSION + 1})"
         in said.splitlines()[-1]
     )
     assert "DIFFERENT" not in said and "NOT the same" not in said
-    found = json.loads(run(["replay", GOLDEN, "--verify", "--json"], monkeypatch, capsys)[1])
+    found = json.loads(told(["replay", GOLDEN, "--verify", "--json"], capsys)[1])
     assert not found["same"]
     assert found["other_numerics"].startswith("made by other numerics")
 
 
 @pytest.mark.usefixtures("other_numerics")
 def test_two_sessions_of_other_numerics_are_compared_as_such_and_check_names_them(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     again = tmp_path / "again.mcap"
     flowrec.replay(GOLDEN, out=again)
     words = ["compare", GOLDEN, again, "--ignore", "diagnostics", "--ignore", "drawings"]  # differ by nature
-    status, said = run(words, monkeypatch, capsys)
+    status, said = told(words, capsys)
     assert status == 3
     assert f"made by other numerics (first: version 1, second: version {NUMERICS_VERSION + 1})" in said
     assert not [line for line in said.splitlines() if line.startswith("/") and "DIFFERENT" in line]
@@ -85,7 +80,7 @@ def test_an_edited_file_is_told_as_such_whatever_its_numerics(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr("flowrec.verbs.replay_result.digest_faults", lambda path: {path: ["a message was changed"]})
-    _, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
+    _, said = told(["replay", GOLDEN, "--verify"], capsys)
     assert "damaged or edited at a message was changed" in said
     assert "NOT the same" in said.splitlines()[-1]
 
@@ -98,7 +93,7 @@ def test_a_difference_by_the_same_numerics_is_one(
     monkeypatch.setattr(
         Kalman, "estimate", lambda self, *arguments: replace(e := honest(self, *arguments), flow_um_s=e.flow_um_s + 1.0)
     )
-    status, said = run(["replay", session, "--verify"], monkeypatch, capsys)
+    status, said = told(["replay", session, "--verify"], capsys)
     assert status == 3
     assert "NOT the same" in said and "DIFFERENT" in said
 

@@ -21,10 +21,10 @@ from flowrec.core.terminal import Progress
 from flowrec.run.control import RunControl
 from flowrec.verbs import replay_segments
 from flowrec.verbs.check_run import FileCheck
-from flowrec.verbs.cli import main
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.listed import columns_for_people
 from flowrec.verbs.ls import ls
+from tests.conftest import run
 
 ROOT = Path(__file__).parents[2]
 MODERATE = ROOT / "sessions" / "golden_moderate.mcap"
@@ -197,11 +197,9 @@ def test_a_verb_that_is_stopped_in_a_part_of_it_is_stopped_and_leaves_nothing(
 
     monkeypatch.setattr(FileCheck, "read", stopped)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["flowrec", verb, str(MODERATE)])
-    with pytest.raises(SystemExit) as ended:
-        main()
+    assert run([verb, MODERATE]) == 130
     told = "".join(capsys.readouterr())
-    assert ended.value.code == 130 and "stopped" in told, told
+    assert "stopped" in told, told
     assert not list(tmp_path.iterdir())
 
 

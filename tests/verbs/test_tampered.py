@@ -36,7 +36,7 @@ AGAIN = pytest.mark.slow("verifies a mission again")
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 PATHS = [topic.path for topic in TOPICS]
-VIEWS = [mirror.path for mirror in VIEWER_TOPICS]
+VIEWS = [mirror.path for mirror in VIEWER_TOPICS if mirror.schema.wire is not None]
 
 
 def run(*words: object) -> tuple[int, str]:

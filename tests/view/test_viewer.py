@@ -96,3 +96,15 @@ def test_a_screenshot_of_nothing_or_without_a_viewer_is_refused_in_one_line(
     monkeypatch.setattr(viewer, "executable", lambda: None)
     with pytest.raises(FlowrecError, match="pip install rerun-sdk"):
         screenshot(tmp_path / "some.rrd", tmp_path / "shot.png")
+
+
+def test_a_character_that_the_viewer_can_not_draw_is_not_told_as_a_lack_of_graphics(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program = tmp_path / "rerun"
+    program.write_text("#!/bin/sh\necho 'wgpu adapter backend: Vulkan' 'panicked: No glyph for X' >&2; exit 101\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(program))
+    (tmp_path / "some.rrd").touch()
+    with pytest.raises(FlowrecError, match="a character of the file that its font lacks"):
+        screenshot(tmp_path / "some.rrd", tmp_path / "shot.png")

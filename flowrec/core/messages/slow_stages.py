@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flowrec.core.declarations import NOT_STATED, Matrix, Message, Raster, Shape, Vector, message_fields
 from flowrec.core.errors import UsageError
-from flowrec.core.units import unit_of
+from flowrec.core.units import seconds, unit_of
 
 if TYPE_CHECKING:
     import pandas
@@ -23,6 +23,7 @@ _LENGTH = 1.6  # of the fastest arrow, in spaces between arrows
 _SOLID, _PATH = "0.85", "tab:red"
 _PLACE = ("y_um", "x_um")
 _DIMS = {"velocity_um_s": (*_PLACE, "component"), "std_um_s": (*_PLACE, "component"), "pressure_pa": _PLACE}
+_LONG_NAMES = {"velocity_um_s": "flow velocity", "std_um_s": "standard deviation", "pressure_pa": "pressure"}
 _NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "error_share", "stamp_ns")
 
 # Columns of a field with a row a pixel.
@@ -125,8 +126,9 @@ class FlowField(Message):
     def to_xarray(self) -> xarray.Dataset:
         """The field as an xarray Dataset: dimensions y_um, x_um (pixel centres, chip frame, y down) and component.
 
-        `velocity_um_s` and `pressure_pa`, and `std_um_s` if the method states it; each says its unit and meaning.
-        Method, note, fluid and boundary values are attributes.
+        `velocity_um_s` and `pressure_pa`, and `std_um_s` if the method states it; each says its unit and meaning. Other
+        coordinates: `fluid`, False in solid, and `time_s`, when the field was adopted, so that
+        `xarray.concat(..., "time_s")` joins several. Method, note and boundary values are attributes.
 
         Raises
         ------
@@ -140,16 +142,26 @@ class FlowField(Message):
             ) from error
         meanings = {each.name: each.meaning for each in message_fields(type(self))}
         variables = {
-            name: (dims, values, {"units": unit_of(name), "description": meanings[name]})
+            name: (
+                dims,
+                values,
+                {"units": unit_of(name), "long_name": _LONG_NAMES[name], "description": meanings[name]},
+            )
             for name, dims in _DIMS.items()
             if (values := getattr(self, name)) is not None
         }
         h, w = self.velocity_um_s.shape[:2]
         places = {"x_um": np.arange(w) * self.um_per_px, "y_um": np.arange(h) * self.um_per_px}
         coordinates: dict[str, Any] = {
-            name: (name, values, {"units": "um", "description": f"centre of the pixel, {name[0]} in the chip frame"})
+            name: (name, values, {"units": "um", "long_name": name[0], "description": VALUES[name]})
             for name, values in places.items()
         }
+        coordinates["fluid"] = _PLACE, fluid_of(self), {"long_name": "fluid", "description": "False in solid"}
+        coordinates["time_s"] = (
+            (),
+            seconds(self.stamp_ns),
+            {"units": "s", "long_name": "time", "description": "when the field was adopted, on the session clock"},
+        )
         facts = {name: value for name in _NUMBERS if (value := getattr(self, name)) is not None}
         facts |= {"method": self.method, "note": self.note, "boundary_values": self.boundary_values.tolist()}
         return xr.Dataset(variables, coordinates | {"component": ["x", "y"]}, facts)

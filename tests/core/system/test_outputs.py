@@ -21,9 +21,8 @@ from flowrec.stages.config import load_config
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import main
 from flowrec.verbs.record import record
-from tests.conftest import until
+from tests.conftest import run, until
 from tests.short_missions import LONG, SMALL
 from tests.store.made_up import HEADER, ticks_of
 
@@ -69,16 +68,14 @@ def folder(short: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def flowrec(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+def flowrec(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
     """The command line in this process: exit status, and the last line on stderr."""
 
     def typed(*words: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
+        status = run(words)
         lines = capsys.readouterr().err.strip().splitlines()
         assert not any("Traceback" in line for line in lines)
-        return int(ended.value.code or 0), lines[-1] if lines else ""
+        return status, lines[-1] if lines else ""
 
     return typed
 

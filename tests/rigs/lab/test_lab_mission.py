@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 import select
-import sys
 import threading
 import tty
 from collections.abc import Callable, Iterator
@@ -25,9 +24,8 @@ from flowrec.stages.pipeline import assemble
 from flowrec.stages.resolve import resolve
 from flowrec.store.session import Session
 from flowrec.verbs.check import check
-from flowrec.verbs.cli import main
 from flowrec.verbs.session_replay import replay_session
-from tests.conftest import needs_quiet
+from tests.conftest import needs_quiet, run
 from tests.extras import why
 from tests.perf.camera_killed import trial
 from tests.twins.coils import Device, device
@@ -172,7 +170,6 @@ def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_f
     sets: tuple[str, ...],
     told: str,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The verb itself, in this process."""
@@ -182,11 +179,9 @@ def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_f
     with emulated(cameras), device(kind, tmp_path) as on, meanwhile(on) as more:
         begin = on.end()
         given = words((*COMMON, RATE, "lab.camera=pylon", *on.sets, *more, *sets))
-        monkeypatch.setattr(sys, "argv", ["flowrec", "record", "--rig", "lab", "--out", str(out / "s.mcap"), *given])
-        with pytest.raises(SystemExit) as ended:
-            main()
+        status = run(["record", "--rig", "lab", "--out", out / "s.mcap", *given])
         assert not on.energised(begin)
-    assert ended.value.code in (1, 2)
+    assert status in (1, 2)
     stderr = capsys.readouterr().err
     lines = [line for line in stderr.splitlines() if line.startswith("flowrec: ")]
     assert len(lines) == 1 and "Traceback" not in stderr
