@@ -116,7 +116,7 @@ class Parent:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no order waits."""
+        """True while no order waits."""
         return self._orders.empty()
 
     def answer(self, pickled: bytes) -> None:
