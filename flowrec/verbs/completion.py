@@ -34,7 +34,7 @@ def complete_section(incomplete: str) -> list[str]:
 
 
 def leave_out_key() -> None:
-    """Of KEY = VALUE, three words for bash, leave the last one to complete; does nothing for other words and shells."""
+    """Complete VALUE alone of KEY = VALUE, which are three words for bash; other words and shells stay as they are."""
     global _key  # noqa: PLW0603 - of this process, which completes once
     if os.environ.get(_BASH) != "complete_bash":
         return
