@@ -61,6 +61,8 @@ def test_the_notebook_runs_from_top_to_bottom_and_shows_what_is_stored(
     from nbclient import NotebookClient
 
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))  # not every user may write to a home
+    if path.stem == WITH_CAMERA and not gige.installed:
+        pytest.skip("needs aravis-tools")
     notebook = nbformat.read(path, as_version=4)
     benches = measured(notebook)
     notebook.cells = [cell for cell in notebook.cells if cell not in benches]
