@@ -63,6 +63,7 @@ _SYMBOLS = {
     "_kg_m3": "kg/m3",
     "_mpa_s": "mPa*s",
     "_per_s": "1/s",
+    "_1_s": "1/s",
     "_um_s": "um/s",
     "_px_s": "px/s",
     "_a_s": "A/s",
