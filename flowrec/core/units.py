@@ -64,6 +64,8 @@ _SYMBOLS = {
     "_mpa_s": "mPa*s",
     "_per_s": "1/s",
     "_1_s": "1/s",
+    "_um2_s3": "um2/s3",
+    "_um2_s": "um2/s",
     "_um_s": "um/s",
     "_px_s": "px/s",
     "_a_s": "A/s",
