@@ -138,6 +138,15 @@ def test_readme_lists_the_methods_of_every_stage_as_the_tables_do() -> None:
         assert len(re.findall(r"`[a-z_]+` \(", line)) == len(listed)
 
 
+def test_every_command_of_readme_is_typed_by_a_script_of_ci() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^```(\w*)\n.*?^```$", readme, re.M | re.S)) == {"sh", "console", "python"}
+    (install,) = blocks(readme, "sh")  # the others are typed by .ci/readme
+    typed = (ROOT / ".ci" / "run").read_text(encoding="utf-8").replace("--quiet ", "")
+    commands = [line.partition("#")[0].strip() for line in install.splitlines() if line.startswith("pip ")]
+    assert len(commands) == 2 and [command for command in commands if command not in typed] == []
+
+
 def test_the_python_example_of_readme_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     (example,) = blocks((ROOT / "README.md").read_text(encoding="utf-8"), "python")
     monkeypatch.chdir(ROOT / "sessions")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import inspect
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from types import FunctionType
 
@@ -53,6 +55,38 @@ def test_every_public_name_is_there_documented_and_known_to_type_checkers() -> N
     assert (Path(flowrec.__file__).parent / "py.typed").is_file()
     for name in flowrec.__all__:
         assert inspect.getdoc(getattr(flowrec, name)), name
+
+
+def test_a_configuration_is_named_by_a_path_or_by_text(tmp_path: Path) -> None:
+    path = tmp_path / "my.toml"
+    path.write_text("camera.width_px = 160")
+    assert flowrec.load_config(str(path)) == flowrec.load_config(path) != flowrec.load_config()
+
+
+@pytest.mark.slow("records, replays and refines as the documentation says: ten seconds")
+def test_the_examples_of_the_documentation_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    session, chip = flowrec.open(GOLDEN), ROOT / "sessions" / "chips" / "y_junction"
+    Path("a.mcap").symlink_to(GOLDEN)
+    for end in (".png", ".toml"):
+        Path("chip").with_suffix(end).write_bytes(chip.with_suffix(end).read_bytes())
+    Path("measured.csv").write_text("x_um,y_um,u_um_s,v_um_s\n1000,2000,200,0\n1500,2000,210,2\n")
+    Path("my.toml").write_text(
+        "\n".join(['mission.phases = ["plan"]', "[camera]", "width_px = 160", "height_px = 128"])
+    )
+    texts = {name: inspect.getdoc(getattr(flowrec, name)) or "" for name in flowrec.__all__}
+    codes = {
+        name: "".join(example.source for example in doctest.DocTestParser().get_examples(text))
+        for name, text in texts.items()
+        if ">>> " in text
+    }
+    assert set(codes) == {"replay", "refine", "solve"}
+    _, block = (flowrec.__doc__ or "").split("\n\n    import flowrec\n")
+    codes["flowrec"] = textwrap.dedent(block.rpartition("\n\n")[0])
+    for code in codes.values():
+        exec(code, {"flowrec": flowrec, "mask": session.chip.mask})
+    assert Path("b.mcap").is_file()
 
 
 def test_every_attribute_of_a_session_is_documented() -> None:

@@ -183,7 +183,7 @@ _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
 
 
 def load_config(
-    path: Path | None = None,
+    path: Path | str | None = None,
     sets: Mapping[str, Any] | Iterable[str] = (),
     flags: Mapping[str, str] | None = None,
 ) -> Config:
@@ -195,7 +195,7 @@ def load_config(
     ------
     UsageError : one line that names the flag or the file, the key, its range and the nearest valid value.
     """
-    tree, given = _read_config(path) if path is not None else {}, settings_of(sets)
+    tree, given = _read_config(Path(path)) if path is not None else {}, settings_of(sets)
     take_registration(tree, given)
     origin = Origin(str(path) if path is not None else "--set", apply_sets(tree, given) | dict(flags or {}))
     config = _config_from(Config, tree, origin)

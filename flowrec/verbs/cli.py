@@ -24,6 +24,7 @@ from flowrec.verbs.calibrate import calibrate
 from flowrec.verbs.check import check
 from flowrec.verbs.command import add_verb, outside_verb
 from flowrec.verbs.compare import compare
+from flowrec.verbs.completion import leave_out_key
 from flowrec.verbs.cut import cut
 from flowrec.verbs.doctor import doctor
 from flowrec.verbs.export import export
@@ -133,6 +134,7 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # the locale's encoding may not have every character
     TRAFFIC.reasons.clear()  # of a call before, in the same process
+    leave_out_key()
     # click's class, which typer has in its own package since 0.29.
     usage_error: Any = typer.BadParameter.__base__
     try:

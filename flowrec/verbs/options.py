@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 from flowrec.core import UsageError, stopped_in_one_line
 from flowrec.store import session_path
+from flowrec.verbs.completion import complete_setting
 
 if TYPE_CHECKING:
     from flowrec.stages import Config
@@ -44,7 +45,12 @@ SessionFile = Annotated[
     AnySession, typer.Argument(metavar="SESSION", callback=session_path, help="Session (.mcap), or its URL.")
 ]
 
-_SET = typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb.")
+_SET = typer.Option(
+    "--set",
+    metavar="KEY=VALUE",
+    help="Change one setting, as in --set control.method=ff_fb.",
+    autocompletion=complete_setting,
+)
 Sets = Annotated[list[str] | Mapping[str, Any] | None, _SET]
 SetTexts = Annotated[list[str] | None, _SET]
 SessionOut = Annotated[

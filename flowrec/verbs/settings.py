@@ -7,6 +7,7 @@ import typer
 
 from flowrec.core import UsageError
 from flowrec.verbs.command import verb
+from flowrec.verbs.completion import complete_section
 
 if TYPE_CHECKING:
     from flowrec.stages import SettingRow
@@ -44,7 +45,12 @@ class SettingSections(dict[str, str]):
 @verb("flowrec settings", "flowrec settings plan", "flowrec settings mission.goal")
 def settings(
     about: Annotated[
-        str | None, typer.Argument(metavar="[SECTION|KEY]", help="Explain this setting, or all of a section.")
+        str | None,
+        typer.Argument(
+            metavar="[SECTION|KEY]",
+            help="Explain this setting, or all of a section.",
+            autocompletion=complete_section,
+        ),
     ] = None,
 ) -> "ExplainedSettings | SettingSections":
     """Explain the settings: meaning, unit, range, default, and the methods that read each.

@@ -102,11 +102,13 @@ def test_the_goal_of_an_example_can_be_reached() -> None:
         ("flowrec rec", "record recover"),
         ("flowrec replay a.mcap --plan astar_t", "astar_time"),
         ("flowrec export a.mcap --format r", "rrd"),
+        ("flowrec record --set plan.method = astar_t", "astar_time"),  # as bash breaks plan.method=astar_t
     ],
 )
-def test_a_shell_completes_verbs_and_methods(words: str, offered: str) -> None:
+def test_a_shell_completes_verbs_methods_and_settings(words: str, offered: str, tmp_path: Path) -> None:
     count = len(words.split()) - 1
     asked = {"_FLOWREC_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count)}
+    asked["XDG_CACHE_HOME"] = str(tmp_path)
     done = subprocess.run(
         [sys.executable, "-m", "flowrec"], env={**os.environ, **asked}, capture_output=True, text=True, check=False
     )

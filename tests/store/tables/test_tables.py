@@ -140,6 +140,8 @@ def test_every_column_has_a_meaning_and_the_unit_that_its_name_ends_in() -> None
     assert meanings["slopes_per_s"] == slopes
     units = [unit_of(name) for name in ("x_um", "u_um_s", "stamp_ns", "viscosity_mpa_s", "nis", "wall_time", "gas")]
     assert units == ["um", "um/s", "ns", "mPa*s", "", "", ""]
+    ratios = [unit_of(name) for name in ("slew_a_s", "mt_per_a", "a_per_v", "v_per_v", "points_per_px", "rate_1_s")]
+    assert ratios == ["A/s", "mT/A", "A/V", "1", "1/px", "1/s"]
 
 
 def test_a_message_that_makes_no_sense_is_an_error_in_a_table_too(tmp_path: Path) -> None:
