@@ -138,7 +138,8 @@ def _look(what: str, check: Callable[..., Generator[_Row, None, T]], *given: Any
     except FlowrecError as error:
         yield what, FAILURE, str(error)
     except OSError as error:
-        yield what, FAILURE, f"{error.strerror or error}; see to it, then try again"
+        named = f"{error.filename}: " if error.filename is not None else ""
+        yield what, FAILURE, f"{named}{error.strerror or error}; see to it, then try again"
     return None
 
 
