@@ -70,6 +70,7 @@ class RunControl:
         }
         self._steered_ns = -_STEERING_NS
         self._zero_sent = self._at_work = self._looping = False
+        self._was_in = False, False  # at work, in an interruptible block: when it was interrupted
 
     # ---- for those who control the run, from any thread
 
@@ -189,8 +190,13 @@ class RunControl:
     def interrupt(self) -> None:
         """In the loop's thread, for example in a signal handler: raise `Interrupted` if the loop must and can end."""
         if self.must_interrupt:
+            self._was_in = self._at_work, self.interruptible.entered
             self._at_work = self.interruptible.entered = False  # so that nothing raises again on the way out
             raise Interrupted
+
+    def interrupt_again(self) -> None:
+        """In the loop's thread, of an `Interrupted` that Python could not raise (the end of an object, a callback)."""
+        self._at_work, self.interruptible.entered = self._was_in
 
     def unless_stopped(self, work: Callable[[], Result], otherwise: Result) -> Result:
         """The result of slow work, or `otherwise` as soon as the run must end."""

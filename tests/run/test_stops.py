@@ -267,3 +267,25 @@ def test_a_guard_shorter_than_the_frames_is_refused_before_anything_is_driven(
         in capsys.readouterr().err
     )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interruption_that_python_swallows_comes_again() -> None:
+    """Compilers and finalizers run Python where it can raise nothing; a stop must not wait for the end of the work."""
+    control = RunControl()
+    ended_in = []
+
+    class Swallows:
+        def __del__(self) -> None:
+            control.stop("stopped by a test")
+            until(lambda: False)
+
+    def work() -> str:
+        thing = Swallows()
+        del thing
+        ended_in.append("after the swallowed one")
+        until(lambda: False)
+        return "worked to its end"
+
+    with Signals(control).handle():
+        assert control.unless_stopped(work, "stopped") == "stopped"
+    assert ended_in
