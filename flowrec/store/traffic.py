@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -109,7 +110,7 @@ def ask_repeatedly(
     for number in range(_TRIES):
         TRAFFIC.add(requests=1, repeated=reason)
         try:
-            return ask(max(0.1, end_s - time.monotonic()))
+            return _unless_interrupted(ask, max(0.1, end_s - time.monotonic()))
         except RefusedError as error:
             raise error.kind(f"{path}: {error}") from error
         except TransientError as error:
@@ -119,6 +120,22 @@ def ask_repeatedly(
                 raise SessionError(f"{path}: can not be {done} ({error}, {tries})") from error
             time.sleep(pause_s)
     raise AssertionError("the last try raises or returns")
+
+
+def _unless_interrupted(ask: Callable[[float], _Answered], limit_s: float) -> _Answered:
+    """The answer. Clients of compiled code take no signal while they wait, so the main thread waits beside one."""
+    if threading.current_thread() is not threading.main_thread():
+        return ask(limit_s)
+    answered: Future[_Answered] = Future()
+
+    def work() -> None:
+        try:
+            answered.set_result(ask(limit_s))
+        except BaseException as error:  # noqa: BLE001 - the main thread raises it
+            answered.set_exception(error)
+
+    threading.Thread(target=work, name="request", daemon=True).start()
+    return answered.result()
 
 
 def timeout_s() -> float:

@@ -5,6 +5,7 @@ No assertion is on wall time: `python -m tests.perf.stops` measures.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import signal
 import sys
@@ -269,23 +270,30 @@ def test_a_guard_shorter_than_the_frames_is_refused_before_anything_is_driven(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interruption_that_python_swallows_comes_again() -> None:
-    """Compilers and finalizers run Python where it can raise nothing; a stop must not wait for the end of the work."""
+@pytest.mark.parametrize("by", ["a finalizer", "a bare except"])
+def test_an_interruption_that_is_swallowed_comes_again(by: str) -> None:
+    """Compilers and finalizers swallow exceptions; a stop must not wait for the end of the work."""
     control = RunControl()
-    ended_in = []
+    swallowed = []
+
+    def wait() -> None:
+        control.stop("stopped by a test")
+        until(lambda: False)
 
     class Swallows:
         def __del__(self) -> None:
-            control.stop("stopped by a test")
-            until(lambda: False)
+            wait()
 
     def work() -> str:
-        thing = Swallows()
-        del thing
-        ended_in.append("after the swallowed one")
+        if by == "a finalizer":
+            Swallows()
+        else:
+            with contextlib.suppress(BaseException):
+                wait()
+        swallowed.append(True)
         until(lambda: False)
         return "worked to its end"
 
     with Signals(control).handle():
         assert control.unless_stopped(work, "stopped") == "stopped"
-    assert ended_in
+    assert swallowed
