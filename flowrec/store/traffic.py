@@ -117,7 +117,9 @@ def ask_repeatedly(
             pause_s, reason = _PAUSE_S * 2.0**number, str(error)
             if number == _TRIES - 1 or time.monotonic() + pause_s > end_s or not wanted():
                 tries = f"{number + 1} tries" if number else "one try"
-                raise SessionError(f"{path}: can not be {done} ({error}, {tries})") from error
+                raise SessionError(
+                    f"{path}: can not be {done} ({error}, {tries}); check address and connection"
+                ) from error
             time.sleep(pause_s)
     raise AssertionError("the last try raises or returns")
 

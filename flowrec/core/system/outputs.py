@@ -85,8 +85,8 @@ class Output:
                 f"{path}: the name must end in {formats}, its format; name it {path.with_suffix(suffixes[0])}"
             )
         if not path.parent.is_dir():
-            there = "is a file, not a directory" if path.parent.exists() else "no such directory; make it"
-            raise OutputError(f"{path.parent}: {there}, or choose another place for {path.name}")
+            there = "is a file, not a directory;" if path.parent.exists() else "no such directory; make it, or"
+            raise OutputError(f"{path.parent}: {there} choose another place for {path.name}")
         for file in files:
             if file.is_file() and is_growing(file):
                 raise OutputError(
