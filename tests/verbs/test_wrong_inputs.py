@@ -93,11 +93,11 @@ def test_an_import_whose_output_is_taken_does_not_look_through_the_movie(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="shells of POSIX")
-def test_with_closed_standard_streams_no_output_gets_into_a_session(tmp_path: Path) -> None:
-    words = f"{sys.executable} -m flowrec cut {GOLDEN} --to 1 -o {tmp_path / 'a.mcap'}"
-    done = subprocess.run(["bash", "-c", f"exec {words} <&- >&- 2>&-"], cwd=ROOT, check=False)
-    assert done.returncode == 0
-    assert command("check", tmp_path / "a.mcap").returncode == 0
+@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])
+def test_a_verb_works_with_closed_standard_streams(closed: str) -> None:
+    words = f"exec {sys.executable} -m flowrec info {GOLDEN} {closed}"
+    done = subprocess.run(["bash", "-c", words], cwd=ROOT, check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
