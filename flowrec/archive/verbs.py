@@ -128,7 +128,7 @@ def _bytes(text: str) -> int:
 
 def _push_told(_asked: Asked, done: "Pushed | StoppedError") -> Told:
     if isinstance(done, StoppedError):  # not after the parts that are being sent, which may take minutes
-        return Told(exit_status=done.exit_status, remarks=lambda: [str(done)], ends_at_once=True)
+        return Told(done.as_json, None, done.exit_status, lambda: [str(done)], ends_at_once=True)
     return Told(
         done.as_json,
         exit_status=done.exit_status,

@@ -79,13 +79,19 @@ class Scenario:
         return Trimmed().treat(observations) if self.observations == "trimmed" else observations
 
 
+def _check_subcells(k: int) -> int:
+    if k not in (1, 2, 4):
+        raise typer.BadParameter(f"{k}: choose 1, 2 or 4 subcells per pixel side")
+    return k
+
+
 def measure(
     cases: Cases = None,
     methods: Names = None,
     noise: Annotated[Literal["00", "02", "05", "10"], typer.Option(help="Noise of the observations in %.")] = "05",
     share: Annotated[Literal["05", "10", "20"], typer.Option(help="Observed part of the skeleton in %.")] = "10",
-    k: Annotated[int, typer.Option("-k", help="Subcells of the solver per pixel side: 1, 2 or 4.")] = 2,
-    outliers: Annotated[float, typer.Option(help="Fraction of the observations that are outliers.")] = 0.0,
+    k: Annotated[int, typer.Option("-k", callback=_check_subcells, help="Subcells per pixel side: 1, 2 or 4.")] = 2,
+    outliers: Annotated[float, typer.Option(min=0, max=1, help="Share of the observations that are outliers.")] = 0.0,
     mask: Annotated[
         Literal["right", "grown", "shrunk", "shifted", "otsu", "adaptive"],
         typer.Option(help="Error of the assumed walls: of one pixel, or those of a picture by a threshold."),

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from typer.core import TyperCommand
 
 from flowrec.core import FIGURE, JSON, FlowField, FlowrecError, Output, StoppedError, UsageError, looked_at, say, table
-from flowrec.verbs import HELP_WIDTH, AsJson, Overwrite, Stoppable
+from flowrec.verbs import HELP_WIDTH, AsJson, CommandLineError, FiniteNumbers, Overwrite, Stoppable, usage_line
 
 Results = dict[str, Any]
 
@@ -41,7 +41,7 @@ _Z = 1.959963984540054  # of a two-sided interval of 95 %
 _BOOTSTRAP_DRAWS = 10_000
 
 
-class _Bench(Stoppable, TyperCommand):
+class _Bench(Stoppable, FiniteNumbers, TyperCommand):
     pass
 
 
@@ -64,7 +64,10 @@ def run(
     )
     app.command(cls=_Bench, help=summary or inspect.getdoc(sys.modules[measure.__module__]))(_command(measure, show))
     try:
-        app(args=words, prog_name=program)
+        sys.exit(app(args=words, prog_name=program, standalone_mode=False) or 0)
+    except CommandLineError as error:
+        sys.stderr.write(usage_line(error))
+        sys.exit(error.exit_code)
     except FlowrecError as error:
         if isinstance(error, StoppedError) and "--json" in (sys.argv if words is None else words):
             typer.echo(json.dumps(error.as_json()))

@@ -54,7 +54,7 @@ def installed_methods(methods: Iterable[str]) -> tuple[str, ...]:
 def measure(
     cases: Cases = None,
     trips: Annotated[int, typer.Option(min=1, help="Channels, one trip through each, down and up.")] = 40,
-    tree_channels: Annotated[int, typer.Option("--trees", help="Channels in which rrt and rrt_star plan.")] = 10,
+    tree_channels: Annotated[int, typer.Option("--trees", min=0, help="Channels in which rrt and rrt_star plan.")] = 10,
     tree_iterations: Annotated[int, typer.Option("--iterations", min=1, help="Iterations of rrt and rrt_star.")] = 4000,
     figure: FigureFile = None,
     methods: Names = None,

@@ -87,7 +87,7 @@ from .system.locks import (
 from .system.numba_setup import compiled as compiled, keep_kernels as keep_kernels, kernels_cached as kernels_cached
 from .system.output_folder import OutputFolder as OutputFolder, marker_of as marker_of
 from .system.outputs import (
-    FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, Output as Output, OutputError as OutputError, PICTURE as PICTURE,
+    FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, MOVIE_FILES as MOVIE_FILES, Output as Output, OutputError as OutputError, PICTURE as PICTURE,
     RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, is_as_written as is_as_written, name_taken as name_taken,
     note_written as note_written, written_sha256 as written_sha256,
 )

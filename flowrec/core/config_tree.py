@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from flowrec.core.errors import UsageError
-from flowrec.core.methods import Methods
+from flowrec.core.methods import Methods, nearest_of
 from flowrec.core.ranges import Fault, hints, range_of
 from flowrec.core.system.toml_file import parse_toml, read_toml
 
@@ -75,7 +75,7 @@ def settings_of(sets: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for text in sets:
         key, equals, value = text.partition("=")
-        if not equals:
+        if not (equals and key.strip()):
             raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
         found.pop(key.strip(), None)  # the last of two counts, also over one of the keys within
         found[key.strip()] = _value(value.strip())
@@ -164,12 +164,13 @@ def type_error(root: type, key: str, value: Any, complaint: str) -> str:
     hint = known.get(key)
     names, valid = _names_of(hint), range_of(hint)
     if names:
-        near = difflib.get_close_matches(str(value), names, 1, 0.0)[0]
-        return f"{key} = {value!r}: must be one of {', '.join(names)}; the nearest is {near}"
+        return f"{key} = {value!r}: must be one of {', '.join(names)}{nearest_of(value, names)}"
     if valid is not None and isinstance(value, (int, float)):
         if value in valid:
             return f"{key} = {value!r}: must be a whole number {valid}; the nearest is {round(value)}"
         return str(Fault(key, value, valid))
+    if isinstance(value, str) and valid is not None:
+        return f"{key} = {value!r}: is no number; one {valid} is wanted, without its unit"
     return f"{key} = {value!r}: {complaint}" + (f"; a number {valid} is wanted" if valid is not None else "")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import pkgutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from flowrec.core.errors import UsageError
 from flowrec.core.outside import Outside, entry_points_of, the_one
 
 OWN = "flowrec"  # the package that our rows come from
+_ALIKE = 0.4  # least likeness of two names, as difflib counts it, of which one may be meant by the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +132,7 @@ class Methods(Mapping[str, Method]):
         row = self._rows.get(name) or self.outside(name)
         if row is None:
             names = self.names()
-            near = difflib.get_close_matches(str(name), names, 1, 0.0)[0]
-            raise UsageError(f"{self.setting} = {name!r}: must be one of {', '.join(names)}; the nearest is {near}")
+            raise UsageError(f"{self.setting} = {name!r}: must be one of {', '.join(names)}{nearest_of(name, names)}")
         return row
 
     def __iter__(self) -> Iterator[str]:
@@ -245,6 +245,12 @@ REPLAYED = {
     "observer": "flowrec.stages.estimation.observer:OBSERVERS",
     "controller": "flowrec.stages.control.controller:CONTROLLERS",
 }
+
+
+def nearest_of(name: object, names: Sequence[str]) -> str:
+    """Text about the name that is most like another, for errors; '' if none is like it."""
+    near = difflib.get_close_matches(str(name), names, 1, _ALIKE)
+    return f"; the nearest is {near[0]}" if near else ""
 
 
 def table_at(target: str) -> Methods:

@@ -182,7 +182,8 @@ def _choose(found: list[Segmentation]) -> Segmentation:
         if best is None or best.quality < 0.3:
             raise ChipError(
                 "no channel is seen: nothing divides the picture along walls that look alike; is the chip in focus, "
-                "and does the channel reach across the picture? A median over a movie has less noise"
+                "and does the channel reach across the picture? A median over a movie has less noise. A field without "
+                "walls, such as a dish, needs a mask (chip.path): white, its first and last row of pixels black"
             )
         raise ChipError(
             f"the channel is not sure enough: {_faults(best)}; take a sharper or more evenly lit picture, or show "

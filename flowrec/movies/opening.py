@@ -41,7 +41,7 @@ def open_movie(path: Path | str, reader: str | None = None, options: ReadOptions
     """
     path = Path(path)
     if not path.exists():
-        raise MovieError(f"{path}: no such movie; it is a file, or a folder of images")
+        raise MovieError(f"{path}: no such movie; it is a file of this machine, or a folder of images")
     name = reader or _reader_by_content(path)
     options = options or ReadOptions()
     return BoundedMovie(path, name, options) if name in _UNPACKING else _load(path, name, options)

@@ -10,6 +10,7 @@ holds no lock.
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -26,6 +27,7 @@ Result = TypeVar("Result")
 LONGEST_TEXT = 500  # characters of an event; what is longer is cut
 RAMP_PATIENCE_S = 0.8  # time for the coils to ramp down by ticks; the next tick then takes all of the field away
 _TICK_PATIENCE_S = 0.3  # time for that tick to come; then the loop is interrupted, and the rig switches the coils off
+_SWALLOWED_S = 0.5  # for work to let `Interrupted` through; then it has swallowed it
 _STUCK_S = 5.0  # time for the loop to be interrupted; then its thread is stuck
 
 _MOST_WAITING = 100  # events; each takes a tick, so more would be recorded seconds after they were asked for
@@ -70,6 +72,8 @@ class RunControl:
         }
         self._steered_ns = -_STEERING_NS
         self._zero_sent = self._at_work = self._looping = False
+        self._working = False  # in `unless_stopped`, also on the way out of it
+        self._raised_s = math.inf  # time of the last `Interrupted`
 
     # ---- for those who control the run, from any thread
 
@@ -189,19 +193,24 @@ class RunControl:
     def interrupt(self) -> None:
         """In the loop's thread, for example in a signal handler: raise `Interrupted` if the loop must and can end."""
         if self.must_interrupt:
+            self._raised_s = self._clock()
             self._at_work = self.interruptible.entered = False  # so that nothing raises again on the way out
             raise Interrupted
+
+    def interrupt_again(self) -> None:
+        """In the loop's thread, of an `Interrupted` that Python could not raise (the end of an object, a callback)."""
+        self._at_work = self._working
 
     def unless_stopped(self, work: Callable[[], Result], otherwise: Result) -> Result:
         """The result of slow work, or `otherwise` as soon as the run must end."""
         try:
-            self._at_work = True
+            self._at_work = self._working = True
             try:
                 return work() if not self.reason else otherwise
             finally:
-                self._at_work = False
+                self._at_work = self._working = False
         except Interrupted:
-            self._at_work = False
+            self._at_work = self._working = False
             return otherwise
 
     # ---- for those who interrupt the loop, from any thread
@@ -212,7 +221,8 @@ class RunControl:
         if not self.reason:
             return False
         late = self._late_s() > RAMP_PATIENCE_S + _TICK_PATIENCE_S or not self.ticking
-        return self._at_work or (self.interruptible.entered and late)
+        swallowed = self._working and self._clock() > self._raised_s + _SWALLOWED_S
+        return self._at_work or swallowed or (self.interruptible.entered and late)
 
     @property
     def stuck(self) -> bool:

@@ -26,10 +26,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from types import FrameType
+from typing import Any
 
 from flowrec.core import Priority, realtime_priority, said_within, status_of, stopped_by
-from flowrec.run.control import RunControl
+from flowrec.run.control import Interrupted, RunControl
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
 
 assert sys.platform != "win32"  # there is no SIGHUP, SIGTSTP or pthread_kill
@@ -98,6 +100,8 @@ class Signals:
                 # The way back first: a signal may raise between any two of these lines.
                 stack.callback(signal.signal, number, signal.getsignal(number))
                 signal.signal(number, handler)
+            stack.callback(setattr, sys, "unraisablehook", sys.unraisablehook)
+            sys.unraisablehook = partial(self._take_swallowed, sys.unraisablehook)
             thread = threading.Thread(target=self._listen, args=(reading,), name="signals", daemon=True)
             thread.start()
             try:
@@ -116,6 +120,13 @@ class Signals:
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._control.interrupt()
+
+    def _take_swallowed(self, before: Callable[[Any], object], found: Any) -> None:
+        """Hook of exceptions that Python can not raise; of an interruption the thread sends another one."""
+        if isinstance(found.exc_value, Interrupted):
+            self._control.interrupt_again()
+        else:
+            before(found)
 
     # ---- the thread
 

@@ -100,7 +100,7 @@ class Columns:
     # name of the column with the time; a number: that for all rows. None: found by its name
     time_s: Column | None = None
     frequency_hz: Column | None = None  # of the rotation of the field
-    heading_deg: Column | None = None  # 0 to the right of the chip, 90 downwards
+    heading_deg: Column | None = None  # 0 to the right of the chip, 90 downwards; counted upwards: ["phi", -1.0]
     amplitude_mt: Column | None = None  # of the rotating field
     heading_rad: Column | None = None  # or in rad, as in applied.csv of flowrec export --format csv
     i_x_a: Column | None = None  # or the currents

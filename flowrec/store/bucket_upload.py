@@ -320,7 +320,7 @@ def _ours(error: Exception) -> Exception | None:
             return RefusedError(f"the server answers {status} {code[:60]}")
         return found
     if isinstance(error, exceptions.NoCredentialsError | exceptions.PartialCredentialsError):
-        return RefusedError("can not be written: there are no credentials in the environment")
+        return RefusedError("can not be written: there are no credentials in the environment (AWS_ACCESS_KEY_ID, ...)")
     if isinstance(error, exceptions.ReadTimeoutError | exceptions.ConnectTimeoutError):
         return TransientError("the server does not answer in time")
     if isinstance(error, exceptions.HTTPClientError | exceptions.ConnectionError):

@@ -30,7 +30,7 @@ from mcap.records import (
     Schema,
 )
 
-from flowrec.core import SessionError
+from flowrec.core import MOVIE_FILES, SessionError
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
@@ -72,6 +72,15 @@ _DAMAGE = (
     OverflowError,
     MemoryError,
 )
+
+
+# Programs that read what is taken for a session, by suffix; else flowrec has no use for it.
+_READ_BY = {
+    **dict.fromkeys(MOVIE_FILES, "flowrec import makes a session of a movie"),
+    ".rrd": "flowrec view shows a recording for Rerun",
+    ".parquet": "flowrec find searches a catalog, flowrec report shows a sweep",
+    ".toml": "flowrec record makes a session by a configuration",
+}
 
 
 class ForeignError(SessionError):
@@ -295,7 +304,8 @@ class McapReader:
         if self.size == 0:
             raise ForeignError(f"{self.path}: is empty; nothing was recorded into it")
         if self.read(0, min(self.size, len(MAGIC))) != MAGIC:
-            raise ForeignError(f"{self.path}: is not an MCAP file; flowrec reads what `flowrec record` has written")
+            meant = _READ_BY.get(self.path.suffix.lower(), "flowrec reads what `flowrec record` has written")
+            raise ForeignError(f"{self.path}: is not an MCAP file; {meant}")
         data = self.read(len(MAGIC), min(self.size - len(MAGIC), _HEADER_LIMIT_BYTES))
         with self.parsing(len(MAGIC)):
             opcode, length = RECORD_HEAD.unpack_from(data)

@@ -225,8 +225,8 @@ def new_mcap(path: Path, *, overwrite: bool) -> McapWriter:
 
 
 @contextlib.contextmanager
-def disk_errors(path: Path) -> Iterator[None]:
-    """Turns an OSError of writing the file into a FileError that says what to do."""
+def disk_errors(path: Path, *, kept: bool = True) -> Iterator[None]:
+    """Turns an OSError of writing the file into a FileError that says what to do; `kept`: a file that fails stays."""
     try:
         yield
     except FileNotFoundError as error:
@@ -239,7 +239,8 @@ def disk_errors(path: Path) -> Iterator[None]:
             what, first = "the disk is full", "free some space"
         elif error.errno == errno.EFBIG:
             what, first = "no file may be larger here", "record in parts (recording.split_mb)"
-        raise FileError(f"{path}: {what}; {first}, then `flowrec recover {path}` saves what was recorded") from error
+        then = f"then `flowrec recover {path}` saves what was recorded" if kept else "then try again; nothing is left"
+        raise FileError(f"{path}: {what}; {first}, {then}") from error
 
 
 def not_writable(path: Path, error: OSError) -> FileError:

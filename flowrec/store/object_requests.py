@@ -231,7 +231,9 @@ def _bucket_errors() -> Iterator[None]:
         if "NotPartial" in text or "NoContentRange" in text:
             raise RefusedError(_WHOLE_ONLY if "NotPartial" in text else _NO_RANGE_TOLD) from error
         if "169.254.169.254" in text or "redential" in text:
-            raise RefusedError("can not be asked for: there are no credentials in the environment") from error
+            raise RefusedError(
+                "can not be asked for: there are no credentials in the environment (AWS_ACCESS_KEY_ID, ...)"
+            ) from error
         status = re.search(r"\b(?:status|Status|code)\D{0,20}([45]\d\d)\b", text)
         raise of_status(int(status[1])) if status else TransientError(reason(text)) from error
 

@@ -224,8 +224,11 @@ def are_there(paths: Sequence[Path]) -> list[bool]:
     ------
     SessionError : a server does not say.
     """
-    with ThreadPoolExecutor(_TOGETHER) as threads:
+    threads = ThreadPoolExecutor(_TOGETHER)
+    try:
         return list(threads.map(_is_there, paths))
+    finally:
+        threads.shutdown(wait=False, cancel_futures=True)  # one that is interrupted waits for no server
 
 
 def _is_there(path: Path) -> bool:

@@ -6,6 +6,7 @@ import base64
 import contextlib
 import hashlib
 import html
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -254,11 +255,11 @@ class Session:
 
     def stamp_ns(self, time_s: float, flag: str = "") -> int:
         """A time of the session in s as a stamp in ns; UsageError, which begins with `flag`, outside of the session."""
-        stamp_ns, first_ns, last_ns = nanoseconds(time_s), self.run.first_ns, self.run.last_ns
-        if not first_ns <= stamp_ns <= last_ns:
+        first_ns, last_ns = self.run.first_ns, self.run.last_ns
+        if not math.isfinite(time_s) or not first_ns <= nanoseconds(time_s) <= last_ns:
             what = f"{flag} {time_s:g}".strip()
             raise UsageError(f"{what}: {self.path} runs from {seconds(first_ns):g} s to {seconds(last_ns):g} s")
-        return stamp_ns
+        return nanoseconds(time_s)
 
     @property
     def key(self) -> str:

@@ -384,7 +384,7 @@ class SessionFile:
     @contextlib.contextmanager
     def _mark_failed(self) -> Iterator[None]:
         try:
-            with disk_errors(self.partial_path):
+            with disk_errors(self.partial_path, kept=self._options.keep_failed):
                 yield
         except BaseException as error:
             self.failure = self.failure or error

@@ -10,6 +10,8 @@ from flowrec.core import UsageError
 
 # A path keeps one slash of the two after the scheme; `az` is Azure, `gs` Google.
 _URL = re.compile(r"(s3|gs|az|https?):/{1,2}(?=[^/])", re.IGNORECASE)
+_OTHER_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(?=[^/])", re.IGNORECASE)  # of two letters or more: no drive
+
 if TYPE_CHECKING:
     from pathlib import Path as _LocalPath
 else:
@@ -38,6 +40,8 @@ def session_path(named: Path | str) -> Path:
     text = str(named)
     found = _URL.match(text)
     if found is None:
+        if (other := _OTHER_URL.match(text)) and not Path(named).parent.exists():
+            raise UsageError(f"{other[1].lower()}://...: sessions are read at https, http, s3, gs and az; copy it here")
         return Path(named)
     rest = text[found.end() :]
     host = rest.partition("/")[0]

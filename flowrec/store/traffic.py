@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -109,16 +110,34 @@ def ask_repeatedly(
     for number in range(_TRIES):
         TRAFFIC.add(requests=1, repeated=reason)
         try:
-            return ask(max(0.1, end_s - time.monotonic()))
+            return _unless_interrupted(ask, max(0.1, end_s - time.monotonic()))
         except RefusedError as error:
             raise error.kind(f"{path}: {error}") from error
         except TransientError as error:
             pause_s, reason = _PAUSE_S * 2.0**number, str(error)
             if number == _TRIES - 1 or time.monotonic() + pause_s > end_s or not wanted():
                 tries = f"{number + 1} tries" if number else "one try"
-                raise SessionError(f"{path}: can not be {done} ({error}, {tries})") from error
+                raise SessionError(
+                    f"{path}: can not be {done} ({error}, {tries}); check address and connection"
+                ) from error
             time.sleep(pause_s)
     raise AssertionError("the last try raises or returns")
+
+
+def _unless_interrupted(ask: Callable[[float], _Answered], limit_s: float) -> _Answered:
+    """The answer. Clients of compiled code take no signal while they wait, so the main thread waits beside one."""
+    if threading.current_thread() is not threading.main_thread():
+        return ask(limit_s)
+    answered: Future[_Answered] = Future()
+
+    def work() -> None:
+        try:
+            answered.set_result(ask(limit_s))
+        except BaseException as error:  # noqa: BLE001 - the main thread raises it
+            answered.set_exception(error)
+
+    threading.Thread(target=work, name="request", daemon=True).start()
+    return answered.result()
 
 
 def timeout_s() -> float:

@@ -1,13 +1,15 @@
 from .check import check as check
 from .cli import main as main
-from .command import MisuseError as MisuseError, Told as Told, verb as verb
+from .command import (
+    CommandLineError as CommandLineError, MisuseError as MisuseError, Told as Told, usage_line as usage_line, verb as verb,
+)
 from .listed import (
     ALWAYS as ALWAYS, LISTS as LISTS, ListedSession as ListedSession, TEXT_LIMIT as TEXT_LIMIT,
     columns_for_people as columns_for_people, columns_of as columns_of, text_of_list as text_of_list, kind_of as kind_of,
 )
 from .listing import NAMES as NAMES, describe as describe, read_each as read_each, runs_of as runs_of
 from .options import (
-    AsJson as AsJson, Asked as Asked, HELP_WIDTH as HELP_WIDTH, HTML as HTML, Overwrite as Overwrite, SetTexts as SetTexts,
+    AsJson as AsJson, Asked as Asked, FiniteNumbers as FiniteNumbers, HELP_WIDTH as HELP_WIDTH, HTML as HTML, Overwrite as Overwrite, SetTexts as SetTexts,
     Stoppable as Stoppable, WholeDescriptions as WholeDescriptions, require_packages as require_packages,
 )
 from .preparation import prepare as prepare, refuse_adrift as refuse_adrift

@@ -109,7 +109,10 @@ def _refuse_doubtful(fit: MotionFit, prepared: Prepared) -> None:
         return
     if may_be_image(found, image, prepared.config, prepared.chip):
         raise turned_log(found, image, prepared.config, prepared.chip)
-    warn(f"the robot moves {found.name}, relative to the log, whose axes are adapted: {image.text}")
+    warn(
+        f"the robot moves {found.name}, relative to the log, which is read so: {image.text}; the columns can state it "
+        "(flowrec settings movie.columns)"
+    )
 
 
 def align_log(looked: Looked) -> Looked:

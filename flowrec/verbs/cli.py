@@ -22,7 +22,7 @@ from flowrec.core import FlowrecError, StoppedError, UsageError, printable
 from flowrec.store import TIMEOUT_KEY, TRAFFIC
 from flowrec.verbs.calibrate import calibrate
 from flowrec.verbs.check import check
-from flowrec.verbs.command import add_verb, outside_verb
+from flowrec.verbs.command import CommandLineError, add_verb, outside_verb, usage_line
 from flowrec.verbs.compare import compare
 from flowrec.verbs.completion import leave_out_key
 from flowrec.verbs.cut import cut
@@ -99,7 +99,13 @@ def root(
     ] = False,
     timeout: Annotated[
         float | None,
-        typer.Option(metavar="S", callback=_timeout, help="Time limit of each request for a session at a URL; 30."),
+        typer.Option(
+            metavar="S",
+            min=0.1,
+            max=3600.0,
+            callback=_timeout,
+            help="Time limit of each request for a session at a URL; 30.",
+        ),
     ] = None,
 ) -> None:
     """Record, replay and view missions of magnetic micro-robots in flow."""
@@ -135,28 +141,27 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # the locale's encoding may not have every character
     TRAFFIC.reasons.clear()  # of a call before, in the same process
     leave_out_key()
-    # click's class, which typer has in its own package since 0.29.
-    usage_error: Any = typer.BadParameter.__base__
     try:
         sys.exit(app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec", standalone_mode=False) or 0)
-    except usage_error as error:
+    except CommandLineError as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # typer has moved the class from version to version
             typer.echo(error.ctx.get_help())
             sys.exit(0)
-        # Of a choice it is in several lines; of a value that pydantic has refused it begins with its own words.
-        message = printable(" ".join(error.format_message().split()).replace("Value error, ", "")).rstrip(".")
-        if message:  # empty if the help was printed
-            verb = error.ctx.command_path if error.ctx is not None else "flowrec"
-            sys.stderr.write(f"flowrec: {message}; see {verb} --help\n")
+        sys.stderr.write(usage_line(error))
         sys.exit(error.exit_code)
     except FlowrecError as error:
         if isinstance(error, StoppedError) and "--json" in sys.argv:
             print(json.dumps(error.as_json()))
         sys.stderr.write(f"flowrec: {error}\n")
+        TRAFFIC.reasons.clear()  # the error says why requests were repeated
         sys.exit(error.exit_status)
     except BrokenPipeError:
         # The reader of the output has ended (flowrec info ... | head).
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        where = f"{printable(str(error.filename))}: " if error.filename is not None else "output or files: "
+        sys.stderr.write(f"flowrec: {where}{error.strerror or error}; check names, permissions and free space\n")
         sys.exit(1)
     finally:
         if TRAFFIC.line:

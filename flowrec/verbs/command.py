@@ -26,10 +26,11 @@ from typer.core import TyperCommand
 from typer.models import ParameterInfo
 
 from flowrec.core import Ended, FlowrecError, UsageError, printable, table_at
-from flowrec.verbs.options import HELP_SETTINGS, AsJson, Asked, Supplied
+from flowrec.verbs.options import HELP_SETTINGS, AsJson, Asked, FiniteNumbers, Supplied
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _SECTION = re.compile(r"^\w+\n-{3,}$|^>>> ", re.MULTILINE)  # of a docstring: what is Python's begins there
+_NO_NUMBER = re.compile(r"Input should be a valid (number|integer), unable to parse string as an? \w+")
 _TOLD_WITHIN_S = 0.3  # of a run that was stopped: a frozen terminal must not delay the exit
 
 
@@ -130,7 +131,7 @@ def add_verb(app: typer.Typer, function: Callable[..., Any], name: str | None = 
     app.command(name or function.__name__, cls=_VerbCommand, help=told.rstrip(), epilog=epilog)(_command(function))
 
 
-class _VerbCommand(TyperCommand):
+class _VerbCommand(FiniteNumbers, TyperCommand):
     """A verb whose help names the methods of its options; the tables are imported when the help is printed."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -211,6 +212,19 @@ def _command(function: Callable[..., Any]) -> Callable[..., None]:
     command.__annotations__ = {each.name: each.annotation for each in parameters}
     command.tables = tables  # type: ignore[attr-defined]
     return command
+
+
+# click's class, which typer has in its own package since 0.29.
+CommandLineError: Any = typer.BadParameter.__base__
+
+
+def usage_line(error: Any) -> str:
+    """The line about a command line that typer refuses; '' if the help was printed instead."""
+    # Of a choice it is in several lines; of a value that pydantic has refused it begins with its own words.
+    message = printable(" ".join(error.format_message().split()).replace("Value error, ", "")).rstrip(".")
+    message = _NO_NUMBER.sub(r"a \1 is wanted, without its unit", message).replace("Input should be", "it must be")
+    verb = error.ctx.command_path if error.ctx is not None else "flowrec"
+    return f"flowrec: {message}; see {verb} --help\n" if message else ""
 
 
 def print_lines(lines: Iterable[str]) -> None:

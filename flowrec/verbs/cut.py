@@ -63,7 +63,9 @@ def cut(
     end_ns = opened.run.last_ns if to_s is None else opened.stamp_ns(to_s, "--to")
     here = [stamp_ns for stamp_ns in opened.reader.stamps("applied") if begin_ns <= stamp_ns <= end_ns]
     if not here:
-        raise UsageError(f"--from {seconds(begin_ns):g} --to {seconds(end_ns):g}: no tick of {opened.path} is there")
+        there = f"no tick of {opened.path} is there; choose a longer stretch"
+        why = "the end is before the begin; exchange them" if end_ns < begin_ns else there
+        raise UsageError(f"--from {seconds(begin_ns):g} --to {seconds(end_ns):g}: {why}")
     path = out if out is not None else opened.path.with_name(f"{opened.path.stem}_cut{MCAP[0]}")
     output = Output(path, MCAP, tuple(files_behind(opened.path)), overwrite)
     output.check(run_files(path))

@@ -138,7 +138,8 @@ def _look(what: str, check: Callable[..., Generator[_Row, None, T]], *given: Any
     except FlowrecError as error:
         yield what, FAILURE, str(error)
     except OSError as error:
-        yield what, FAILURE, f"{error.strerror or error}; see to it, then try again"
+        named = f"{error.filename}: " if error.filename is not None else ""
+        yield what, FAILURE, f"{named}{error.strerror or error}; see to it, then try again"
     return None
 
 
@@ -173,7 +174,8 @@ def _mission(config: ResolvedConfig, chip: Chip) -> _Rows:
         yield "mission", FAILURE, f"no route on the assumed flow: {route.reason}; choose another goal"
         return
     length_mm = 1e-3 * float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
-    yield "mission", OK, f"{', '.join(mission.phases)}; a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s"
+    way = f"a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s" if length_mm else "back to the start"
+    yield "mission", OK, f"{', '.join(mission.phases)}; {way}"
 
 
 def _kernels(config: ResolvedConfig) -> _Rows:

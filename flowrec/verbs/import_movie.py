@@ -78,7 +78,7 @@ def import_movie(
     ------
     FlowrecError : in one line: what can not be read, what does not fit together, what is not told.
     """
-    from flowrec.core import settings_of
+    from flowrec.core import MCAP, Output, settings_of
 
     given = {} if fps is None else {"movie.rate_hz": fps}
     flags = dict.fromkeys(given, "--fps")
@@ -88,5 +88,7 @@ def import_movie(
 
     asked = asked_import(movie, chosen, coils=coils, times=times, fps=fps, partial=partial)
     path = None if out is None else Path(out)
+    if path is not None:  # before the whole movie is looked through
+        Output(path, MCAP, (*inputs,), overwrite).check()
     looked = fit_import(asked, path.parent if path is not None else Path(), str(robot), align=align)
     return run_mission(looked.asked, path, overwrite=overwrite, control=control, inputs=inputs, looked=looked)

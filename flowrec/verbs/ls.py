@@ -30,6 +30,9 @@ class Listing(list[ListedSession]):
             return
         doubtful = [number for number, row in enumerate(self) if is_doubtful(row)]
         title = ", ".join(map(str, self.places))
+        if not self:
+            say(f"{title}: no session (.mcap) is there, or none that is asked for")
+            return
         table(title, *columns_for_people(self, width()), text="notes", amber=doubtful)
         for row in self:
             if row.duration_s is None:

@@ -1,5 +1,6 @@
 """`flowrec new`: a package of a lab's own methods and devices, which works from the start."""
 
+import importlib.util
 import keyword
 import re
 from pathlib import Path
@@ -35,6 +36,8 @@ def new(
     """Write a package that adds a planner, a camera, a topic, an export and a verb, for a lab to replace by its own."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name) or name == "flowrec":
         raise UsageError(f"{name}: no name for a module; use lower-case letters, digits and _, as in lab_planners")
+    if importlib.util.find_spec(name) is not None and name != _PLUGIN:
+        raise UsageError(f"{name}: is the name of an installed package or of Python's own; choose another one")
     target = folder or Path(name)
     try:
         target.mkdir()

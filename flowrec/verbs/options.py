@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import pkgutil
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -124,6 +125,18 @@ class WholeDescriptions(TyperGroup):
         ]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
+
+
+class FiniteNumbers:
+    """Base of a command whose options take no number that is NaN or infinite: no work can be done with one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        left: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
+        for option in self.params:  # type: ignore[attr-defined]
+            value = ctx.params.get(option.name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise typer.BadParameter(f"{value:g} is no number to work with; give a finite one", ctx, option)
+        return left
 
 
 class Stoppable:

@@ -72,7 +72,7 @@ class Choice:
         """Refuse a pattern that means nothing that is there: UsageError."""
         for option, patterns in (("--only", self.only), ("--ignore", self.ignore)):
             for pattern in patterns:
-                known = (*names, *GROUPS, *HEAD)
+                known = list(dict.fromkeys((*names, *GROUPS, *HEAD)))
                 if pattern in (*GROUPS, *HEAD) or any(self.means(pattern, name) for name in names):
                     continue
                 near = difflib.get_close_matches(pattern, known, 3, 0.5)

@@ -11,6 +11,8 @@ from flowrec.verbs.command import Told, verb
 from flowrec.verbs.export import export, export_json
 from flowrec.verbs.options import Overwrite
 
+_RRD = b"RRF"  # with which a recording of Rerun begins
+
 
 @verb(
     "flowrec view a.mcap",
@@ -79,6 +81,8 @@ def view(
         raise UsageError("SESSION: name a session (.mcap), or --live for a run that is being recorded")
     if session.suffix == ".rrd" and not session.exists():
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
+    if session.suffix == ".rrd":
+        _check_recording(session)
     if beside is not None and ".rrd" in (session.suffix, beside.suffix):
         raise UsageError(f"{session} and {beside}: two sessions (.mcap) are shown in one view, not .rrd files")
     if layout is not None:
@@ -87,12 +91,34 @@ def view(
         return _write_layouts(session, layout, overwrite)
     if screenshot is not None:
         Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
+    if time is not None:
+        _check_time(session, time, screenshot)
     rrd, told = _recording(session, beside, out, overwrite)
     if screenshot is not None:
         told += [*take(rrd, screenshot, time_s=time, overwrite=overwrite), f"{screenshot} written"]
     elif not no_open:
         told += filter(None, [open_viewer(rrd)])
     return Told(lambda: export_json(session, rrd), remarks=lambda: told)
+
+
+def _check_recording(file: Path) -> None:
+    """Refuse what is no recording of Rerun: its viewer would be waited for."""
+    try:
+        with file.open("rb") as opened:
+            begins = opened.read(len(_RRD))
+    except OSError as error:
+        raise FlowrecError(f"{file}: can not be read ({error.strerror or error}); check its permissions") from error
+    if begins != _RRD:
+        raise FlowrecError(f"{file}: is no recording of Rerun; flowrec export makes one of a session")
+
+
+def _check_time(session: Path, time_s: float, screenshot: Path | None) -> None:
+    from flowrec.store import Session
+
+    if screenshot is None:
+        raise UsageError(f"--time {time_s:g}: is the time of a picture; say --screenshot PNG, too")
+    if session.suffix != ".rrd":
+        Session.of(session).stamp_ns(time_s, "--time")
 
 
 def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: bool) -> tuple[Path, list[str]]:

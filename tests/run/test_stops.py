@@ -5,6 +5,7 @@ No assertion is on wall time: `python -m tests.perf.stops` measures.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import signal
 import sys
@@ -263,3 +264,32 @@ def test_a_guard_shorter_than_the_frames_is_refused_before_anything_is_driven(
         in capsys.readouterr().err
     )
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("by", ["a finalizer", "a bare except"])
+def test_an_interruption_that_is_swallowed_comes_again(by: str) -> None:
+    """Compilers and finalizers swallow exceptions; a stop must not wait for the end of the work."""
+    control = RunControl()
+    swallowed = []
+
+    def wait() -> None:
+        control.stop("stopped by a test")
+        until(lambda: False)
+
+    class Swallows:
+        def __del__(self) -> None:
+            wait()
+
+    def work() -> str:
+        if by == "a finalizer":
+            Swallows()
+        else:
+            with contextlib.suppress(BaseException):
+                wait()
+        swallowed.append(True)
+        until(lambda: False)
+        return "worked to its end"
+
+    with Signals(control).handle():
+        assert control.unless_stopped(work, "stopped") == "stopped"
+    assert swallowed

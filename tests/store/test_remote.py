@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
@@ -19,7 +23,7 @@ from flowrec.store import remote_file, traffic
 from flowrec.store.object_requests import _redirect_target
 from flowrec.store.run_files import session_sha256
 from flowrec.store.session_path import UrlPath, session_path
-from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError
+from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError, ask_repeatedly
 from flowrec.verbs.cli import app
 from tests.conftest import HANG_S, run
 from tests.extras import needs
@@ -255,3 +259,29 @@ def test_a_session_in_a_bucket_is_the_file_and_credentials_are_never_printed(
 def test_layouts_of_a_session_at_a_url_are_written_here(server: RangeServer, tmp_path: Path) -> None:
     made = write_layouts(server.url, tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted([made.foxglove, made.rerun])
+
+
+def test_a_request_that_takes_no_signal_does_not_hold_up_the_end() -> None:
+    """Clients of compiled code wait for their server whatever signal comes."""
+    asked, released = threading.Event(), threading.Timer(5.0, lambda: None)
+    released.start()
+
+    def ask(_limit_s: float) -> str:
+        asked.set()
+        while released.is_alive():
+            with suppress(KeyboardInterrupt):
+                released.join()
+        return "answered"
+
+    def interrupt() -> None:
+        asked.wait()
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=interrupt).start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            ask_repeatedly(Path("https://host/a.mcap"), ask)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        released.cancel()

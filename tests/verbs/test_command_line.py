@@ -61,6 +61,11 @@ def test_the_help_of_replay_and_export_names_every_method_of_every_table() -> No
         (["record", "--split", "3"], "as in --split 2GB,10min"),
         (["record", "--goal", "1,2,3"], "a point is two numbers in um; as in --goal 4400,1500"),
         (["replay", "a.mcap", "--verify", "--refly"], "--verify only compares"),
+        (["replay", SESSIONS / "golden.mcap", "--verify", "--from", "nan"], "'--from': nan is no number"),
+        (["bench", "flow", "--outliers", "inf"], "'--outliers': it must be less than or equal to 1"),
+        (["bench", "plan", "--trips", "0"], "'--trips': it must be greater than or equal to 1"),
+        (["cut", "a.mcap", "--from", "5s"], "'--from': a number is wanted, without its unit"),
+        (["--timeout", "-1", "methods"], "'--timeout': it must be greater than or equal to 0.1"),
     ],
 )
 def test_wrong_usage_is_told_in_one_line_that_names_the_help(

@@ -258,3 +258,11 @@ def test_an_interruption_leaves_sessions_at_urls_unread_that_still_wait() -> Non
         if thread.name.startswith("sessions"):
             thread.join(HANG_S)
     assert len(begun) < 100
+
+
+def test_a_folder_without_a_session_is_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ls([tmp_path]).show()
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.splitlines() == [
+        f"{tmp_path}: no session (.mcap) is there, or none that is asked for"
+    ]

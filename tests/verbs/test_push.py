@@ -19,7 +19,9 @@ from typer.testing import CliRunner
 
 import flowrec
 from flowrec.archive.push import PushedFile, push
+from flowrec.archive.verbs import push as push_verb
 from flowrec.core.errors import FlowrecError, UsageError
+from flowrec.core.system.endings import Ended, StoppedError
 from flowrec.store import bucket_upload, remote_file, traffic
 from flowrec.store.run_files import part_path, session_sha256
 from flowrec.store.session import Session
@@ -159,6 +161,11 @@ def test_a_push_that_is_killed_or_interrupted_goes_on_where_it_was(
     assert there in (2, 3) and done.sent_bytes == large.stat().st_size - there * PART_BYTES
     assert not server.client.list_multipart_uploads(Bucket=BUCKET).get("Uploads")
     assert not [file for file in large.parent.iterdir() if file != large]  # no state beside it
+
+
+def test_a_push_that_is_stopped_says_so_in_json_too() -> None:
+    told = push_verb.verb.result({}, StoppedError(Ended(), "what was sent stays"))  # type: ignore[attr-defined]
+    assert told.as_json is not None and told.as_json()["exit_status"] == told.exit_status == 130
 
 
 def test_what_another_upload_has_left_is_not_taken_for_ours(server: S3Server, large: Path) -> None:

@@ -24,7 +24,7 @@ from flowrec.verbs.check_run import FileCheck
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.listed import columns_for_people
 from flowrec.verbs.ls import ls
-from tests.conftest import run
+from tests.conftest import HANG_S, run
 
 ROOT = Path(__file__).parents[2]
 MODERATE = ROOT / "sessions" / "golden_moderate.mcap"
@@ -151,7 +151,7 @@ terminal.Progress.__call__ = told
 """
 
 
-def stopped(words: list[object], before: str) -> subprocess.CompletedProcess[str]:
+def stopped(words: list[object], before: str, limit_s: float | None = None) -> subprocess.CompletedProcess[str]:
     """A verb in a process of its own."""
     return subprocess.run(
         [sys.executable, "-c", SCRIPT.format(before=before, words=[str(word) for word in words])],
@@ -160,6 +160,7 @@ def stopped(words: list[object], before: str) -> subprocess.CompletedProcess[str
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
         capture_output=True,
         text=True,
+        timeout=limit_s,
     )
 
 
@@ -172,6 +173,15 @@ def test_a_signal_during_imports_is_one_line(verb: str, module: str, name: str, 
     assert done.returncode == status
     assert done.stderr.startswith("flowrec: stopped (SIG") and done.stderr.count("\n") == 1, done.stderr
     assert done.stdout == ""
+
+
+def test_a_verb_that_is_stopped_does_not_wait_for_its_threads() -> None:
+    """As for one that asks a server which does not answer."""
+    waits = (
+        "from concurrent.futures import ThreadPoolExecutor; ThreadPoolExecutor(1).submit(__import__('time').sleep, 600)"
+    )
+    done = stopped(["report", MODERATE], waits + AT_IMPORT.format(module="numpy", name="SIGINT"), HANG_S)
+    assert done.returncode == 130 and done.stderr.startswith("flowrec: stopped (SIGINT"), done.stderr
 
 
 @pytest.mark.slow("stops two verbs in processes of their own")

@@ -186,7 +186,7 @@ def read_rows(path: Path) -> list[Row]:
         reason = str(error).partition("\n")[0]
         raise SessionError(f"{path}: can not be read as Parquet ({reason}); flowrec sweep writes such files") from error
     if not is_sweep(table.schema):
-        raise OutputError(f"{path}: was not written by flowrec sweep, and stays; choose another name")
+        raise OutputError(f"{path}: was not written by flowrec sweep; name a table that was, or a new one")
     settings, names = settings_in(table), json.loads(table.schema.metadata[_OURS])["figures"]
     rows = []
     for columns in table.to_pylist():

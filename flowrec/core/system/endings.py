@@ -122,6 +122,8 @@ def one_line_at_the_end() -> Iterator[None]:
         yield
     except SystemExit as done:
         status = done.code if isinstance(done.code, int) else int(done.code is not None)
+        if arrived and status == status_of(arrived[-1]):  # its line is printed
+            _end_now(status)
         _set_all(lambda *_: os._exit(status))  # the rest of Python may wait for threads
         raise
     except BaseException as error:
@@ -145,5 +147,12 @@ def _exit(ended: Ended) -> NoReturn:
         sys.stdout.flush()
     with suppress(OSError, ValueError):
         sys.stderr.write(f"flowrec: {StoppedError(ended)}\n")
-        sys.stderr.flush()
-    os._exit(ended.status)
+    _end_now(ended.status)
+
+
+def _end_now(status: int) -> NoReturn:
+    """The end of the process; the rest of Python would wait for threads, as one that asks a server."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)

@@ -27,6 +27,7 @@ PICTURE = (".png",)
 FIGURE = (".png", ".pdf", ".svg")
 JSON = (".json",)
 TOML = (".toml",)
+MOVIE_FILES = (".avi", ".mp4", ".mkv", ".mov", ".tif", ".tiff", ".nd2")  # that flowrec import reads, among others
 WEIGHTS = (".safetensors",)
 
 # Hidden file of a folder: its exports that are single files. One that is a folder has a list of its own, its marker.
@@ -84,7 +85,8 @@ class Output:
                 f"{path}: the name must end in {formats}, its format; name it {path.with_suffix(suffixes[0])}"
             )
         if not path.parent.is_dir():
-            raise OutputError(f"{path.parent}: no such directory; make it, or choose another place for {path.name}")
+            there = "is a file, not a directory;" if path.parent.exists() else "no such directory; make it, or"
+            raise OutputError(f"{path.parent}: {there} choose another place for {path.name}")
         for file in files:
             if file.is_file() and is_growing(file):
                 raise OutputError(

@@ -184,7 +184,7 @@ def read_table(path: Path) -> Table:
             return _check_rows(path, _excel_rows(path))
         text = _text(path.read_bytes())
     except FileNotFoundError as error:
-        raise UsageError(f"{path}: no such table") from error
+        raise UsageError(f"{path}: no such file; a table is CSV or Excel (.xlsx)") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{path}: is no text that can be read; save it as CSV in UTF-8, or as .xlsx") from error
     except OSError as error:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.core.errors import UsageError
+from flowrec.core.system.outputs import MOVIE_FILES
 from flowrec.core.system.regular_file import refuse_irregular
 
 _NOT_TOML = {
@@ -16,6 +17,8 @@ _NOT_TOML = {
     ".mcap": "a session",
     ".png": "the mask of a chip (--set chip.path=...)",
     ".npz": "a vessel case (--set chip.path=...)",
+    **dict.fromkeys((".csv", ".xlsx"), "a table (--coils takes the log of the coils)"),
+    **dict.fromkeys(MOVIE_FILES, "a movie (flowrec init, flowrec import)"),
 }
 
 
@@ -69,8 +72,12 @@ def read_toml(path: Path) -> dict[str, Any]:
         tree = parse_toml(path.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
     except FileNotFoundError as error:
         raise UsageError(f"{path}: no such configuration; {begin}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: can not be read as a TOML configuration ({error})") from error
-    except (ValueError, RecursionError) as error:
+    except OSError as error:
+        raise UsageError(f"{path}: can not be read as a TOML configuration ({error.strerror or error})") from error
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path}: is no text in UTF-8 (byte {error.start}); save it so, or name a TOML") from error
+    except tomllib.TOMLDecodeError as error:
         raise UsageError(f"{path}: not valid TOML ({error}); mend that line") from error
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path}: is no TOML that flowrec has a use for ({error}); {begin}") from error
     return tree

@@ -144,7 +144,8 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
     try:
         table = parse_toml(toml_text)
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
-        raise ChipError(f"{where}: not valid TOML ({error}); mend that line") from error
+        beside = f"{where.removesuffix('.png')}.toml" if where.endswith(".png") else where
+        raise ChipError(f"{beside}: not valid TOML ({error}); mend that line") from error
     _refuse_unknown(table, CHIP_KEYS, where)
     law, of_law = _law(table.get("viscosity", {}), where)
     number: dict[str, Any] = {key: _number(table, key, where, value) for key, value in (_NUMBERS | of_law).items()}

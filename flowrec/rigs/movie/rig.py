@@ -160,6 +160,6 @@ def _refuse_missing(config: Config, source: MovieSource) -> None:
     example = " ".join(_ASKED[key] for key in missing)
     hint = f" (the file says {source.facts.um_per_px:.6g} um per pixel)" if source.facts.um_per_px is not None else ""
     raise UsageError(
-        f"{source.path}: {source.facts.describe()}; it does not tell {', '.join(missing)}{hint}; give them in a TOML "
-        f"configuration, as in {example}"
+        f"{source.path}: {source.facts.describe()}; it does not tell {', '.join(missing)}{hint}; flowrec init "
+        f"{source.path} asks for them, or give them in a TOML, as in {example}"
     )

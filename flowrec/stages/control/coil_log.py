@@ -121,7 +121,10 @@ def _kind_of(table: Table, columns: Columns) -> tuple[str, str, str]:
     lacks = missing[nearest]
     given = getattr(columns, lacks[0])
     if given is not None:
-        raise MovieError(f"{table.where}: no column {_name(given)!r}; its columns are {', '.join(table.header)}")
+        raise MovieError(
+            f"{table.where}: no column {_name(given)!r}; its columns are {', '.join(table.header)}; correct "
+            f"movie.columns.{lacks[0]}"
+        )
     near = difflib.get_close_matches(lacks[0], table.header, 1, 0.5)
     example = near[0] if near else table.header[0]
     raise MovieError(
