@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 LAB = Path("lab")  # said instead of a movie
 _INLET, _INLET_SPEED = "--inlet", "--inlet-speed"
 _OF_CHIP = {
-    _INLET: "openings that are inlets, with commas between: {openings}",
+    _INLET: "openings that are inlets, with commas between; there are: {openings}",
     _INLET_SPEED: "mean speed of the fluid at the inlets in um/s, as the pump says",
 }
 _ANSWERED = {"inlets": _INLET, "inlet_speed_um_s": _INLET_SPEED}  # by parameter of calibrate_chip
@@ -27,6 +27,7 @@ _OPTIONS = {  # by setting: the option that sets it, and the question
     "camera.um_per_px": ("--um-per-px", "micrometres per pixel of the image"),
     "robot.radius_um": ("--radius", "radius of the robot in um"),
 }
+_FLAGS = {key: option for key, (option, _) in _OPTIONS.items()} | {"robot.um_per_rev": "--um-per-rev"}
 _ASKED_OF_COILS = {"serial": ("lab.serial.port",), "ni": ("lab.ni.channels",)}  # by amplifier
 
 
@@ -90,7 +91,8 @@ def init(
     um_per_px: Annotated[float | None, typer.Option("--um-per-px", metavar="UM", help="Scale of the image.")] = None,
     radius_um: Annotated[float | None, typer.Option("--radius", metavar="UM", help="Radius of the robot.")] = None,
     inlet: Annotated[
-        list[str] | None, typer.Option(_INLET, metavar="SIDE:N", help="Opening that is an inlet; may be repeated.")
+        list[str] | None,
+        typer.Option(_INLET, metavar="SIDE:N", help="Openings that are inlets, with commas between; may be repeated."),
     ] = None,
     inlet_speed_um_s: Annotated[
         float | None, typer.Option(_INLET_SPEED, metavar="UM_S", help="Mean speed at the inlets, in um/s.")
@@ -138,6 +140,7 @@ def init(
     own_chip = "chip.path" in given
     if own_chip and no_chip:
         raise UsageError("--no-chip: chip.path names a chip; leave one of them out")
+    inlet = [name for text in inlet or () for name in text.split(",")]
     of_chip = {} if no_chip or own_chip else {_INLET: inlet, _INLET_SPEED: inlet_speed_um_s}
     missing = _questions(subject) | {option: _OF_CHIP[option] for option, value in of_chip.items() if not value}
     seen = calibrate_chip(subject.picture) if missing and of_chip else None
@@ -147,7 +150,7 @@ def init(
         settled["chip.path"] = chip.name
     if no_chip:
         settled |= {"chip.um_per_px": settled["camera.um_per_px"], "chip.inlet_speed_um_s": 0.0}  # nothing else knows
-    config = load_config(None, settled)
+    config = load_config(None, settled, _FLAGS)
     if lab and not config.mission.observes:
         _try_amplifier(config)
     if no_chip:
@@ -166,7 +169,7 @@ def _movie_subject(movie: Path, coils: Path | None, given: Mapping[str, Any]) ->
     """Size and scale of a movie, and the columns of its log."""
     from flowrec.core import read_table, say
     from flowrec.movies import open_movie
-    from flowrec.stages import columns_by_unit
+    from flowrec.stages import columns_by_unit, load_config, read_coil_log
 
     columns = columns_by_unit(read_table(coils).header) if coils is not None else {}
     with open_movie(movie) as opened:
@@ -174,6 +177,9 @@ def _movie_subject(movie: Path, coils: Path | None, given: Mapping[str, Any]) ->
     say(f"{movie}: {facts.describe()}")
     told = {} if facts.um_per_px is None else {"camera.um_per_px": facts.um_per_px}
     sets = {f"movie.columns.{key}": name for key, name in columns.items()} | told | dict(given)
+    if coils is not None:  # a log that an import would refuse is refused before anybody is asked
+        config = load_config(None, sets, _FLAGS)
+        read_coil_log(coils, config.movie.columns, config.coils)
     return _Subject(sets, movie, (facts.width_px, facts.height_px), timed=facts.times_ns is not None)
 
 
@@ -209,7 +215,7 @@ def _questions(subject: _Subject) -> dict[str, str]:
     """Questions about the settings that are not known, by setting."""
     from flowrec.stages import load_config, not_measured, setting_rows
 
-    config = load_config(None, subject.sets)
+    config = load_config(None, subject.sets, _FLAGS)
     keys = [key for key in _OPTIONS if key not in subject.sets]
     if config.rig == "lab":
         keys += [key for key in not_measured(config) if key not in _OPTIONS]
@@ -259,7 +265,7 @@ def _reader(key: str) -> Callable[[str], Any]:
             if key == _INLET_SPEED:
                 return float(text)
             answer = settings_of([f"{key}={text}"])
-            load_config(None, answer)
+            load_config(None, answer, {key: "the answer"})
             return answer[key]
         except (ValueError, FlowrecError) as error:
             raise typer.BadParameter(str(error)) from error

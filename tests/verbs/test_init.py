@@ -37,7 +37,8 @@ def test_what_a_movie_does_not_tell_is_listed_at_once_beside_a_picture_that_name
     with pytest.raises(UsageError, match=r"missing, and nobody to ask: --radius, --inlet, --inlet-speed$"):
         init(MOVIE, um_per_px=13.0, out=out)
     assert (
-        "--inlet   openings that are inlets, with commas between: left:0, right:0, bottom:0" in capsys.readouterr().err
+        "--inlet   openings that are inlets, with commas between; there are: left:0, right:0, bottom:0"
+        in capsys.readouterr().err
     )
     assert [each.name for each in tmp_path.iterdir()] == ["robot_openings.png"]
     with pytest.raises(UsageError, match=r"nobody to ask: --inlet-speed$"):
@@ -103,6 +104,17 @@ def test_a_movie_without_a_channel_is_tracked(tmp_path: Path) -> None:
     assert np.allclose(places_um[: len(centres)], 2.0 * np.array(centres), atol=0.4)
     with pytest.raises(UsageError, match=r"--no-chip: chip\.path names a chip"):
         init(folder, no_chip=True, sets={"chip.path": "mine.png"}, out=tmp_path / "b.toml")
+
+
+def test_what_is_wrong_is_named_by_its_option_and_leaves_no_file(tmp_path: Path) -> None:
+    out = tmp_path / "flowrec.toml"
+    with pytest.raises(UsageError, match=r"^--radius: robot\.radius_um = -5"):
+        init(MOVIE, **{**KNOWN, "radius_um": -5.0}, out=out)
+    log = tmp_path / "log.csv"
+    log.write_text("one,two\n1,2\n2,3\n")
+    with pytest.raises(UsageError, match=r"log\.csv: .*column"):
+        init(MOVIE, **KNOWN, coils=log, out=out)
+    assert [each.name for each in tmp_path.iterdir()] == ["log.csv"]
 
 
 def test_the_configuration_of_a_lab_holds_what_its_camera_says_and_a_chip_of_its_image(tmp_path: Path) -> None:
