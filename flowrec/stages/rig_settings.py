@@ -150,7 +150,7 @@ class OutputLimits:
 class SerialPort:
     """Section [lab.serial]: the microcontroller of the amplifier `serial`."""
 
-    port: str = ""  # to which it is connected: '/dev/ttyACM0'
+    port: str = ""  # serial port to which it is connected, such as '/dev/ttyACM0'
     baud: Annotated[int, Range(9600, 12_000_000)] = 115_200  # a board with USB of its own ignores it
 
 

@@ -224,7 +224,12 @@ def _questions(subject: _Subject) -> dict[str, str]:
             of_coils = (*_ASKED_OF_COILS.get(config.lab.amplifier, ()), "coils.max_current_a")
             keys += [key for key in of_coils if key not in subject.sets]
     rows = {row.key: row for row in setting_rows()}
-    return {key: _OPTIONS[key][1] if key in _OPTIONS else f"{rows[key].meaning}, {rows[key].facts}" for key in keys}
+
+    def question(key: str) -> str:
+        facts = rows[key].facts
+        return ", ".join([rows[key].meaning, *([facts] if facts != "text" else [])])
+
+    return {key: _OPTIONS[key][1] if key in _OPTIONS else question(key) for key in keys}
 
 
 def _answers(
