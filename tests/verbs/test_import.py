@@ -255,7 +255,7 @@ BAD = {
         lambda lab: {"coils": lab.table("nan.csv", [HEADER, (0, "nan", 0, 4)])},
         "line 2: frequency_hz is nan",
     ),
-    "no log": (lambda lab: {"coils": lab.folder / "absent.csv"}, "absent.csv: no such table"),
+    "no log": (lambda lab: {"coils": lab.folder / "absent.csv"}, "absent.csv: no such file"),
     "truncated": (lambda lab: {"movie": "cut.avi"}, r"breaks off: .* --partial takes the \d+ images before it"),
     "no movie": (lambda lab: {"movie": "chip.toml"}, "no movie that can be read"),
     "damaged": (lambda lab: {"movie": "damaged", "fps": 30.0}, r"img_40.png: .* or --partial takes the 40 images"),

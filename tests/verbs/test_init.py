@@ -41,8 +41,6 @@ def test_what_a_movie_does_not_tell_is_listed_at_once_beside_a_picture_that_name
         in capsys.readouterr().err
     )
     assert [each.name for each in tmp_path.iterdir()] == ["robot_openings.png"]
-    with pytest.raises(UsageError, match=r"nobody to ask: --inlet-speed$"):
-        init(MOVIE, **{**KNOWN, "inlet_speed_um_s": None}, out=out)
 
 
 @pytest.mark.slow("imports a movie")
@@ -117,6 +115,7 @@ def test_what_is_wrong_is_named_by_its_option_and_leaves_no_file(tmp_path: Path)
     assert [each.name for each in tmp_path.iterdir()] == ["log.csv"]
 
 
+@pytest.mark.slow("watches a camera, and looks for a channel")
 def test_the_configuration_of_a_lab_holds_what_its_camera_says_and_a_chip_of_its_image(tmp_path: Path) -> None:
     sets = {"lab.camera": "opencv", "lab.device": str(MOVIE), "mission.phases": "observe"}
     done = init(LAB_WORD, **KNOWN, sets=sets, out=tmp_path / "lab.toml")
@@ -137,6 +136,7 @@ def test_the_configuration_of_a_lab_holds_what_its_camera_says_and_a_chip_of_its
     ]
 
 
+@pytest.mark.slow("watches a camera")
 def test_a_lab_that_drives_is_asked_for_every_limit_of_robot_and_coils(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
