@@ -19,12 +19,9 @@ from flowrec.core import (
     Observations,
     Route,
     Track,
-    doubts_of,
-    flow_text,
     of_text,
     printable,
-    text_of_figure,
-    way_text,
+    verdict_lines,
     with_micro,
 )
 from flowrec.store.codec import Payload
@@ -107,17 +104,11 @@ def tracking_error(demand: Demand, _scene: ViewerScene) -> Payload:
 
 
 def verdict(outcome: Mapping[str, str], scene: ViewerScene) -> Payload:
-    """The end of the run, what was won, doubts, and what the colours mean, a line each."""
-    figures = of_text(outcome)
-    ended, duration = outcome.get("outcome", "not finished"), figures.get("duration_s")
-    after = f" after {text_of_figure('duration_s', duration)}" if duration is not None else ""
+    """The sentences of the end of a run, and what the colours mean, a line each."""
+    ended = {"outcome": "not finished", **of_text(outcome)}
     top = f"; speed of the maps: 0 (violet) to {scene.top_um_s:.0f} um/s (yellow)" if scene.top_um_s else ""
     lines = (
-        f"{ended}{after}",
-        way_text(figures),
-        flow_text(figures),
-        outcome.get("note", ""),
-        *(f"doubtful: {each}" for each in doubts_of(outcome)),
+        *verdict_lines(ended, scene.refined),
         f"robot: orange; route: cyan; goal: green{top}; a square of the 3-D view: 1 mm",
         "more, with error bars: flowrec view FILE",
     )
