@@ -209,7 +209,7 @@ def test_rerun_makes_views_of_the_bare_file_by_itself_for_verdict_numbers_and_a_
         columns = chunk.to_record_batch()
         found.setdefault(str(chunk.entity_path), {}).update(zip(columns.schema.names, columns.columns, strict=True))
     (text,) = found["/verdict"]["TextDocument:text"].to_pylist()[0]
-    assert text.startswith(f"{session.outcome['outcome']}\n\n") and "69 µm/s (yellow)" in text
+    assert text.startswith(f"{session.outcome['outcome'].capitalize()}\n\n") and "69 µm/s (yellow)" in text
     errors = [number for (number,) in found["/view/tracking_error_um"]["Scalars:scalars"].to_pylist()]
     assert errors[-1] == p.ERROR_UM
     (speed,) = found["/view/flow_at_robot_um_s"]["Scalars:scalars"].to_pylist()[-1]
