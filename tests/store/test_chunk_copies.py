@@ -168,7 +168,7 @@ def test_an_image_that_makes_no_sense_under_a_right_checksum_is_left_out_alone(f
     (lost,) = [image for image in before[FRAMES] if b"mono9" in image[1]]
     before[FRAMES].remove(lost)
     after, verdict = messages_of(done.path), SLOTS["/verdict"].channel
-    assert b"ended" in before.pop(verdict)[0][1] and b"cut\n\nrecovered" in after.pop(verdict)[0][1]
+    assert b"Ended" in before.pop(verdict)[0][1] and b"Cut\n\nRecovered" in after.pop(verdict)[0][1]
     assert after == before and not recover(done.path).changed
 
 
