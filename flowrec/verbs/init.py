@@ -143,7 +143,7 @@ def init(
     inlet = [name for text in inlet or () for name in text.split(",")]
     of_chip = {} if no_chip or own_chip else {_INLET: inlet, _INLET_SPEED: inlet_speed_um_s}
     missing = _questions(subject) | {option: _OF_CHIP[option] for option, value in of_chip.items() if not value}
-    seen = calibrate_chip(subject.picture) if missing and of_chip else None
+    seen = _channel_of(subject.picture) if of_chip else None
     answers = {} if not missing else _answers(missing, seen, subject, out.with_name(f"{source.stem}_openings.png"))
     settled = subject.sets | {key: value for key, value in answers.items() if key not in _OF_CHIP}
     if not own_chip:
@@ -163,6 +163,16 @@ def init(
     with output.new_file() as part:
         part.write_text(head + commented_toml(config, changed_only=True), encoding="utf-8")
     return StartedConfig(source, out, None if own_chip else chip, coils, subject.timed)
+
+
+def _channel_of(picture: Path) -> "PictureChip":
+    from flowrec.core import ChipError
+    from flowrec.measure import calibrate_chip
+
+    try:
+        return calibrate_chip(picture)
+    except ChipError as error:
+        raise ChipError(f"{error}; where there is no channel, say --no-chip: track only") from error
 
 
 def _movie_subject(movie: Path, coils: Path | None, given: Mapping[str, Any]) -> _Subject:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import RigError, UsageError
+from flowrec.core.errors import ChipError, RigError, UsageError
 from flowrec.core.system.outputs import OutputError
 from flowrec.movies.opening import open_movie
 from flowrec.physics.chip.io import load_chip
@@ -113,6 +113,9 @@ def test_what_is_wrong_is_named_by_its_option_and_leaves_no_file(tmp_path: Path)
     with pytest.raises(UsageError, match=r"log\.csv: .*column"):
         init(MOVIE, **KNOWN, coils=log, out=out)
     assert [each.name for each in tmp_path.iterdir()] == ["log.csv"]
+    cv2.imwrite(str(tmp_path / "dish.png"), np.full((120, 160), 128, np.uint8))
+    with pytest.raises(ChipError, match="where there is no channel, say --no-chip"):
+        init(tmp_path / "dish.png", **KNOWN, out=out)
 
 
 @pytest.mark.slow("watches a camera, and looks for a channel")
