@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from flowrec.bench.figures import INK, MM_PER_UM, QUIET, SOLID, new_figure, style
+from flowrec.bench.figures import INK, QUIET, SOLID, new_figure, style
+from flowrec.core import MM_PER_UM
 from flowrec.exports import style as report_style
 
 if TYPE_CHECKING:

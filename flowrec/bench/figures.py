@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.core import MM_PER_UM
 from flowrec.exports import style as report_style
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 SOLID = "#d4d4d4"
 INK = "#262626"
 QUIET = "#8c8c8c"
-MM_PER_UM, MM_PER_INCH = report_style.MM_PER_UM, report_style.MM_PER_INCH
+MM_PER_INCH = report_style.MM_PER_INCH
 # Distinguishable with colour blindness (Okabe and Ito), then lighter and darker ones.
 _PALETTE = (
     "#d55e00", "#e69f00", "#0072b2", "#56b4e9", "#009e73", "#88c9b5", "#999999", "#cc79a7", "#7a5195", "#5c4a1f",

@@ -11,11 +11,11 @@ import json
 import platform
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
-from flowrec.core import UsageError
+from flowrec.core import DOUBTS, FlowField, UsageError, Value, completes_mission, verdict_lines
 from flowrec.view import Feed, FeedSink, Scene, viewer
 
 PACKAGES = ("starlette", "uvicorn", "websockets")  # of the extra `console`
@@ -72,6 +72,13 @@ class RunEnded(NamedTuple):
     good: bool = False
     told: tuple[str, ...] = ()
     doubtful: bool = False
+
+    @classmethod
+    def of(cls, figures: Mapping[str, Value], refined: FlowField | None, files: str) -> RunEnded:
+        """The end of a run with these figures and this last map."""
+        outcome = str(figures.get("outcome", "unknown"))
+        told = tuple(verdict_lines(figures, refined))
+        return cls(outcome, files, completes_mission(outcome), told, doubtful=bool(figures.get(DOUBTS)))
 
 
 def refuse_without_packages() -> None:

@@ -24,7 +24,7 @@ from .declared_topics import (
 from .diagnostics import CameraLosses as CameraLosses, Clocks as Clocks, Drops as Drops, Timing as Timing
 from .enums import (
     ALARM_WORDS as ALARM_WORDS, Action as Action, Alarm as Alarm, AxesVerdict as AxesVerdict, Level as Level, Outcome as Outcome,
-    Phase as Phase, View as View, WorkOrder as WorkOrder,
+    Phase as Phase, View as View, WorkOrder as WorkOrder, completes_mission as completes_mission,
 )
 from .errors import (
     ChipError as ChipError, FlowError as FlowError, FlowrecError as FlowrecError, MovieError as MovieError,
@@ -62,7 +62,7 @@ from .summary import (
     finite as finite, is_count as is_count, is_numeric as is_numeric, name_of as name_of, of_text as of_text,
     rows_for_people as rows_for_people, text_of_figure as text_of_figure,
     end_text as end_text, flow_text as flow_text, goal_text as goal_text, verdict_lines as verdict_lines,
-    way_text as way_text, with_micro as with_micro,
+    text_for_picture as text_for_picture, way_text as way_text, with_micro as with_micro,
 )
 from .system.blas_threads import one_blas_thread as one_blas_thread
 from .system.bounded_process import BoundedProcess as BoundedProcess
@@ -89,7 +89,7 @@ from .system.output_folder import OutputFolder as OutputFolder, marker_of as mar
 from .system.outputs import (
     FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, MOVIE_FILES as MOVIE_FILES, Output as Output, OutputError as OutputError, PICTURE as PICTURE,
     RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, is_as_written as is_as_written, name_taken as name_taken,
-    note_written as note_written, written_sha256 as written_sha256,
+    named_otherwise as named_otherwise, note_written as note_written, written_sha256 as written_sha256,
 )
 from .system.processes import (
     Priority as Priority, child_command as child_command, child_environment as child_environment,

@@ -67,6 +67,11 @@ class Outcome(StrEnum):
         )
 
 
+def completes_mission(outcome: str) -> bool:
+    """True of a text, as a file has it, that is the outcome of a completed mission."""
+    return any(outcome == each and each.completes_mission for each in Outcome)
+
+
 class Level(StrEnum):
     """Severity of an event."""
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from flowrec.core.enums import Outcome
+from flowrec.core.errors import printable
 
 if TYPE_CHECKING:
     from flowrec.core.declarations import Floats
@@ -160,8 +161,9 @@ def _in_brackets(text: str | None) -> str:
 
 def goal_text(goal_um: Floats | None) -> str:
     """The goal (2,) of a mission, um on the chip; 'none' without one, or where it is not finite."""
-    known = goal_um is not None and all(map(math.isfinite, goal_um))
-    return f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um" if known and goal_um is not None else "none"
+    if goal_um is None or not all(map(math.isfinite, goal_um)):
+        return "none"
+    return f"({goal_um[0]:.0f}, {goal_um[1]:.0f}) um"
 
 
 def learned_text(refined: FlowField | None) -> str:
@@ -191,6 +193,12 @@ def verdict_lines(figures: Mapping[str, Value], refined: FlowField | None = None
 def with_micro(text: str) -> str:
     """Text for a picture or a page: um and +-, as a terminal and a file may have them, as µm and ±."""
     return _UM.sub("µm", text).replace("+-", "±")
+
+
+def text_for_picture(text: str, longest: int) -> str:
+    """Text of a file for a picture or a page: printable, units as there, of so many characters at most."""
+    shown = with_micro(printable(text))
+    return shown if len(shown) <= longest else shown[: longest - 2] + " …"
 
 
 def is_numeric(key: str) -> bool:

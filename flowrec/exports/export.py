@@ -16,6 +16,7 @@ from flowrec.core import (
     OutputFolder,
     UsageError,
     is_as_written,
+    named_otherwise,
     note_written,
     progress,
     say,
@@ -129,7 +130,6 @@ def _target(sessions: tuple[Session, ...], suffixes: tuple[str, ...], file_forma
     out = Path(out)
     other = out.suffix.lstrip(".")
     if suffixes[0] and out.suffix not in suffixes and other in EXPORTS and not out.is_dir():
-        named = f"the name must end in {' or '.join(suffixes)}, its format; name it {out.with_suffix(suffixes[0])}"
-        raise OutputError(f"{out}: {named}, or write that format by flowrec export --format {other}")
+        raise OutputError(f"{named_otherwise(out, suffixes)}, or write that format by flowrec export --format {other}")
     within = suffixes[0] and out.is_dir() and out.suffix not in suffixes
     return out / f"{stems[0]}{suffix}" if within else out

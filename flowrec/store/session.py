@@ -22,11 +22,10 @@ from flowrec.core import (
     nanoseconds,
     of_text,
     parse_toml,
-    printable,
     rows_for_people,
     seconds,
+    text_for_picture,
     verdict_lines,
-    with_micro,
 )
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run
@@ -402,8 +401,7 @@ def card(
 
 
 def _escape(text: str, longest: int = _CARD_TEXT) -> str:
-    shown = with_micro(printable(text))
-    return html.escape(shown if len(shown) <= longest else shown[: longest - 2] + " …")
+    return html.escape(text_for_picture(text, longest))
 
 
 def _thumbnail(image: NDArray[np.uint8 | np.uint16]) -> bytes:

@@ -22,7 +22,6 @@ from flowrec.core import (
     of_text,
     printable,
     verdict_lines,
-    with_micro,
 )
 from flowrec.store.codec import Payload
 from flowrec.store.schema import plot_schema, ros_schema
@@ -106,13 +105,13 @@ def tracking_error(demand: Demand, _scene: ViewerScene) -> Payload:
 def verdict(outcome: Mapping[str, str], scene: ViewerScene) -> Payload:
     """The sentences of the end of a run, and what the colours mean, a line each."""
     ended = {"outcome": "not finished", **of_text(outcome)}
-    top = f"; speed of the maps: 0 (violet) to {scene.top_um_s:.0f} um/s (yellow)" if scene.top_um_s else ""
+    top = f"; speed of the maps: 0 (violet) to {scene.top_um_s:.0f} µm/s (yellow)" if scene.top_um_s else ""
     lines = (
         *verdict_lines(ended, scene.refined),
         f"robot: orange; route: cyan; goal: green{top}; a square of the 3-D view: 1 mm",
         "more, with error bars: flowrec view FILE",
     )
-    data = with_micro("\n\n".join(printable(line) for line in lines if line)).encode() + b"\0"
+    data = "\n\n".join(map(printable, lines)).encode() + b"\0"
     return (_CDR, struct.pack("<I", len(data)), data)
 
 

@@ -126,20 +126,23 @@ def init(
     UsageError : facts are missing, and nobody can be asked.
     FlowrecError : the movie can not be read, a device not be used, no channel is seen for sure, or a file not written.
     """
-    from flowrec.core import TOML, Output, UsageError, settings_of
-    from flowrec.measure import calibrate_chip
+    from flowrec.core import PICTURE, TOML, Output, UsageError, settings_of
+    from flowrec.measure import calibrate_chip, open_field
     from flowrec.stages import commented_toml, load_config
 
     output = Output(out, TOML, (source,), overwrite)
     output.check()
     options = {"camera.um_per_px": um_per_px, "robot.radius_um": radius_um, "robot.um_per_rev": um_per_rev}
     given = settings_of(sets or ()) | {key: value for key, value in options.items() if value is not None}
-    lab = source == LAB and not source.exists()
-    subject = _lab_subject(given, out.parent, no_chip) if lab else _movie_subject(source, coils, given)
-    chip = out.with_name(f"{source.stem}_chip{'.png' if no_chip else '.toml'}")
     own_chip = "chip.path" in given
     if own_chip and no_chip:
         raise UsageError("--no-chip: chip.path names a chip; leave one of them out")
+    of_mask = PICTURE if no_chip else TOML
+    chip = Output(out.with_name(f"{source.stem}_chip{of_mask[0]}"), of_mask, (), overwrite)
+    if not own_chip:
+        chip.check()
+    lab = source == LAB and not source.exists()
+    subject = _lab_subject(given, out.parent, no_chip) if lab else _movie_subject(source, coils, given)
     inlet = [name for text in inlet or () for name in text.split(",")]
     of_chip = {} if no_chip or own_chip else {_INLET: inlet, _INLET_SPEED: inlet_speed_um_s}
     missing = _questions(subject) | {option: _OF_CHIP[option] for option, value in of_chip.items() if not value}
@@ -147,22 +150,23 @@ def init(
     answers = {} if not missing else _answers(missing, seen, subject, out.with_name(f"{source.stem}_openings.png"))
     settled = subject.sets | {key: value for key, value in answers.items() if key not in _OF_CHIP}
     if not own_chip:
-        settled["chip.path"] = chip.name
+        settled["chip.path"] = chip.path.name
     if no_chip:
         settled |= {"chip.um_per_px": settled["camera.um_per_px"], "chip.inlet_speed_um_s": 0.0}  # nothing else knows
     config = load_config(None, settled, _FLAGS)
     if lab and not config.mission.observes:
         _try_amplifier(config)
     if no_chip:
-        _write_open_field(chip, subject.size_px, overwrite)
+        with chip.new_file() as part:
+            part.write_bytes(open_field(*subject.size_px))
     elif not own_chip:
         told: dict[str, Any] = {"inlets": inlet, "inlet_speed_um_s": inlet_speed_um_s}
         told |= {name: answers[option] for name, option in _ANSWERED.items() if option in answers}
-        calibrate_chip(subject.picture, chip, settled["camera.um_per_px"], **told, overwrite=overwrite, seen=seen)
+        calibrate_chip(subject.picture, chip.path, settled["camera.um_per_px"], **told, overwrite=overwrite, seen=seen)
     head = f"# By flowrec init, for {source.name}. flowrec settings explains what else can be set.\n\n"
     with output.new_file() as part:
         part.write_text(head + commented_toml(config, changed_only=True), encoding="utf-8")
-    return StartedConfig(source, out, None if own_chip else chip, coils, subject.timed)
+    return StartedConfig(source, out, None if own_chip else chip.path, coils, subject.timed)
 
 
 def _channel_of(picture: Path) -> "PictureChip":
@@ -299,13 +303,3 @@ def _try_amplifier(config: "Config") -> None:
     say(f"amplifier {name}: {seen.amplitude_mt:.3g} mT up to {seen.rotation_hz:.3g} Hz within the limits")
     for warning in seen.warnings:
         say(warning)
-
-
-def _write_open_field(chip: Path, size_px: tuple[int, int], overwrite: bool) -> None:
-    from flowrec.core import PICTURE, Output
-    from flowrec.measure import open_field
-
-    output = Output(chip, PICTURE, (), overwrite)
-    output.check()
-    with output.new_file() as part:
-        part.write_bytes(open_field(*size_px))

@@ -27,7 +27,6 @@ from flowrec.core import (
     kernels_cached,
     realtime_priority,
     say,
-    verdict_lines,
     warn,
 )
 from flowrec.rigs import Connecting, MovieRig, Picturing, Rig
@@ -303,10 +302,8 @@ class _Mission:
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
         writer.close(outcome, CLOSE_TIMEOUT_S if self.run_control.reason else None, why=bad)
         _report_remarks(writer)
-        told = tuple(verdict_lines(self._facts, report.last.refined))
         files = files_text(self._output.path, tuple(writer.files))
-        done = report.outcome in set(Outcome) and Outcome(report.outcome).completes_mission
-        return RunEnded(report.outcome, files, done, told, doubtful=DOUBTS in self._facts)
+        return RunEnded.of(self._facts, report.last.refined, files)
 
     def result(self) -> Recorded:
         """The result, after all is closed."""

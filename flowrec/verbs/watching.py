@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from flowrec.console import Console, RunEnded, refuse_without_packages
-from flowrec.core import DOUBTS, FlowrecError, Outcome, Tick, UsageError, View, of_text, say, seconds, verdict_lines
+from flowrec.core import FlowrecError, Tick, UsageError, View, of_text, say, seconds
 from flowrec.physics import Chip
 from flowrec.run import RemoteControl, Sink
 from flowrec.stages import ResolvedConfig
@@ -118,11 +118,7 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool =
             for sink in shown.sinks:
                 sink.write(tick)
             last = tick
-        outcome, figures = run.outcome.get("outcome", "unknown"), of_text(run.outcome)
-        text = f"the run has ended at {seconds(max(last.stamp_ns, 0)):.1f} s: {outcome}"
-        told = tuple(verdict_lines(figures, last.refined))
-        done = outcome in set(Outcome) and Outcome(outcome).completes_mission
-        ended = RunEnded(outcome, str(run.path), done, told, doubtful=bool(figures.get(DOUBTS)))
-        say(f"{run.path}: {text}")
+        ended = RunEnded.of(of_text(run.outcome), last.refined, str(run.path))
+        say(f"{run.path}: the run has ended at {seconds(max(last.stamp_ns, 0)):.1f} s: {ended.outcome}")
     finally:
         shown.close(ended)

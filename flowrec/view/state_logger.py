@@ -15,8 +15,8 @@ from flowrec.core import (
     Message,
     Mission,
     OperatorEvent,
-    Outcome,
     Track,
+    completes_mission,
 )
 from flowrec.view import colours
 from flowrec.view import entities as e
@@ -68,7 +68,7 @@ class StateLogger:
         name, colour = mission.phase, colours.OF_PHASE.get(mission.phase, colours.GREY)
         if mission.finished and mission.outcome:
             name = mission.outcome
-            done = name in set(Outcome) and Outcome(name).completes_mission
+            done = completes_mission(name)
             colour = colours.RED if not done else colours.YELLOW if self.doubtful else colours.GREEN
         if len(self.phases) < _PHASES:
             self.phases.setdefault(name, mission.since_ns)

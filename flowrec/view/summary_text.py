@@ -19,11 +19,10 @@ from flowrec.core import (
     doubts_text,
     flow_text,
     goal_text,
-    printable,
     seconds,
+    text_for_picture,
     verdict_lines,
     way_text,
-    with_micro,
 )
 from flowrec.physics import on_chip
 from flowrec.stages import MotionOfRun, RunStatistics, TrackQuality, figures_of
@@ -166,5 +165,4 @@ def registration_remark(refined: FlowField | None) -> str:
 
 def _cell(text: str, letters: int = _LETTERS) -> str:
     """Text as it is, without Markdown, HTML or control characters."""
-    shown = with_micro(printable(text))
-    return (shown if len(shown) <= letters else shown[: letters - 2] + " …").translate(_MARKDOWN)
+    return text_for_picture(text, letters).translate(_MARKDOWN)

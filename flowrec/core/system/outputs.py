@@ -80,10 +80,7 @@ class Output:
                     f"{file}: is read by this command and stays as it is; choose another name for the output"
                 )
         if path.suffix not in suffixes:
-            formats = " or ".join(suffixes)
-            raise OutputError(
-                f"{path}: the name must end in {formats}, its format; name it {path.with_suffix(suffixes[0])}"
-            )
+            raise OutputError(named_otherwise(path, suffixes))
         if not path.parent.is_dir():
             there = "is a file, not a directory;" if path.parent.exists() else "no such directory; make it, or"
             raise OutputError(f"{path.parent}: {there} choose another place for {path.name}")
@@ -133,6 +130,11 @@ class Output:
             raise name_taken(path)
         if path.is_symlink() or sha256_of(path) != self.replaces:
             raise name_taken(path, ", and was changed since flowrec wrote it")
+
+
+def named_otherwise(path: Path, suffixes: tuple[str, ...]) -> str:
+    """Text of the error for a name that is not that of the format."""
+    return f"{path}: the name must end in {' or '.join(suffixes)}, its format; name it {path.with_suffix(suffixes[0])}"
 
 
 def name_taken(path: Path, kept: str = "") -> OutputError:

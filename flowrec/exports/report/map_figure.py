@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flowrec.core import Bools, Floats, FlowField
+from flowrec.core import MM_PER_UM, Bools, Floats, FlowField
 from flowrec.exports.report import style
 from flowrec.exports.report.path_figure import scale_bar
 from flowrec.exports.report.report_data import ReportData
@@ -172,7 +172,7 @@ def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figur
         bar = figure.colorbar(shown, ax=ax, shrink=0.9, aspect=16, pad=0.02, ticks=panel.scale.ticks)
         bar.ax.set_yticklabels(panel.scale.labels)
         bar.outline.set_visible(False)
-    scale_bar(axes[0], 1.0 / (um_per_px * style.MM_PER_UM))  # pixels of the mask in a millimetre
+    scale_bar(axes[0], 1.0 / (um_per_px * MM_PER_UM))  # pixels of the mask in a millimetre
     return figure
 
 

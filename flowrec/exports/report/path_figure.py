@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flowrec.core import Floats
+from flowrec.core import MM_PER_UM, Floats
 from flowrec.exports.report import style
 from flowrec.exports.report.report_data import ReportData
 from flowrec.view import Box, arrow_grid, flow_arrows, goal_of, length_text, place_on_chip, round_below, speed, way_of
@@ -59,7 +59,7 @@ class PathFigure:
 
     def alt(self, data: ReportData) -> str:
         path = data.path_um
-        length_mm = float(np.nansum(np.hypot(*np.diff(path, axis=0).T))) * style.MM_PER_UM
+        length_mm = float(np.nansum(np.hypot(*np.diff(path, axis=0).T))) * MM_PER_UM
         return f"Map of the chip {data.scene.chip.name} with the robot's path of {length_mm:.1f} mm."
 
     def draw(self, data: ReportData, width_mm: float) -> Figure:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-MM_PER_UM = 1e-3
 MM_PER_INCH = 25.4
 NARROW_MM, WIDE_MM = 88.0, 180.0  # one and two columns of a journal
 WIDTHS_MM = (NARROW_MM, WIDE_MM)
