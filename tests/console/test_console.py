@@ -396,14 +396,17 @@ def test_the_end_is_shown_and_the_server_ends(scene: Scene, ticks: Ticks) -> Non
         pid = served.console.pid
         for tick in ticks(3):
             served.console.write(tick)
-        told = ("Reached after 35.1 s", "Doubtful: axes")
-        served.console.close(RunEnded("reached", "a.mcap (1 MB)", good=True, told=told, doubtful=True))
+        told = ("Reached after 35.1 s, doubtful", "Doubtful: axes")
+        figures = {"outcome": "reached", "duration_s": 35.1, "doubts": "axes"}
+        served.console.close(RunEnded.of(figures, None, "a.mcap (1 MB)"))
         words = json.loads([each for each in page if isinstance(each, str)][-1])
         ended = {"outcome": "reached", "files": "a.mcap (1 MB)", "good": True, "told": [*told], "doubtful": True}
         assert words["ended"] == ended
         assert words["state"]["time_s"] == 0.03
     until(lambda: not psutil.pid_exists(pid or 0))
     assert served.told == []
+    stopped = RunEnded.of({"outcome": "stopped"}, None, "a.mcap")
+    assert (stopped.good, stopped.doubtful, stopped.told) == (False, False, ("Stopped",))
 
 
 @pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP])

@@ -174,6 +174,7 @@ def test_init_finds_camera_and_amplifier_of_a_lab_and_leaves_its_coils_without_a
         assert "camera" not in {finding.what for finding in looked.findings if finding.level == "failure"}
     config = load_config(out)
     assert (config.camera.width_px, config.camera.height_px) == (4096, 4096), "the whole sensor"
+    assert config.camera.exposure_s == pytest.approx(0.01), "that of the emulator, not flowrec's default"
     assert config.lab.device == "0815-0000" and config.coils.max_current_a == 1.5
 
 
