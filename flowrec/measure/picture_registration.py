@@ -80,6 +80,11 @@ def _is_blank(picture: Image) -> bool:
     return float(np.ptp(picture)) < _LEAST_CONTRAST
 
 
+def _shows_walls(picture: Image, chip: Chip) -> bool:
+    """False where the picture is small or blank, or the chip, like an open field, has walls along its border only."""
+    return not (_is_small(picture) or _is_blank(picture) or chip.mask[1:-1, 1:-1].all())
+
+
 def register(
     picture: Image, chip: Chip, um_per_px: tuple[float, float], mirrors: tuple[bool, ...] = (False, True)
 ) -> tuple[WallFit, ...]:
@@ -132,7 +137,7 @@ def fit_nearby(picture: Image, chip: Chip, assumed: Calibration) -> WallFit | No
 
     None if the picture does not show the walls nearby.
     """
-    if _is_small(picture) or _is_blank(picture):
+    if not _shows_walls(picture, chip):
         return None
     scene = _ChipInPicture(picture, chip)
     grown = [AS_STATED.about(assumed, scene.middle_px, growth) for growth in _NEAR_GROWTHS]
@@ -231,7 +236,7 @@ class ImageVerdict(NamedTuple):
 
 def orientation_by_image(picture: Image, chip: Chip, stated: Calibration) -> ImageVerdict:
     """The verdict of a picture (h, w) on the stated registration."""
-    if _is_small(picture) or _is_blank(picture):
+    if not _shows_walls(picture, chip):
         return ImageVerdict("", ())
     scene = _ChipInPicture(picture, chip)
 

@@ -10,6 +10,7 @@ import numpy as np
 from flowrec.core import UM_PER_M, Floats, FlowError, FlowField, OneOf, Range
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.fluid import law_text
+from flowrec.physics.flow import grid as grids
 from flowrec.physics.flow.generalised import GeneralisedSystem, generalised_system
 from flowrec.physics.flow.linear_solver import chip_key, compute_cached
 from flowrec.physics.flow.newton_solver import NotConvergedError, Scales, System, system
@@ -40,22 +41,29 @@ class FlowSolver:
         FlowError
             If the openings can not carry a flow, or convection does not converge.
         """
-        equations, scales, flux = self._steady(chip)
-        load = equations.residual(flux, scales.drive, scales.inertia)
-        residual = equations.unbalanced_fraction(flux, load)
+        self._check(chip)
+        if any(opening.value for opening in chip.openings):
+            equations, scales, flux = self._steady(chip)
+            load = equations.residual(flux, scales.drive, scales.inertia)
+            residual = equations.unbalanced_fraction(flux, load)
+            grid, velocity = equations.grid, equations.velocity(flux)
+            pressure = grid.pressure(equations.pressure(load)) * scales.pressure
+        else:  # nothing drives the fluid: it stands still, and the matrices of a large dish would take seconds
+            grid, residual = grids.build(chip, self.k), 0.0
+            velocity, pressure = np.zeros((int(chip.mask.sum()), 2)), np.zeros(chip.mask.shape)
         return FlowField(
             stamp_ns=0,
             request=0,
             method="fvm",
             um_per_px=chip.um_per_px,
-            velocity_um_s=fluid_image(chip.mask, equations.velocity(flux) * UM_PER_M).astype(np.float32),
-            pressure_pa=(equations.grid.pressure(equations.pressure(load)) * scales.pressure).astype(np.float32),
+            velocity_um_s=fluid_image(chip.mask, velocity * UM_PER_M).astype(np.float32),
+            pressure_pa=pressure.astype(np.float32),
             std_um_s=None,
             boundary_values=chip.boundary_values,
             viscosity_mpa_s=chip.viscosity_mpa_s,
             density_kg_m3=chip.density_kg_m3,
             note=f"residual {'below 1e-9' if residual < ROUNDING else f'{residual:.0e}'}",
-            wall_px=equations.grid.wall_px,
+            wall_px=grid.wall_px,
             viscosity_law=law_text(chip.law),
         )
 
@@ -71,16 +79,14 @@ class FlowSolver:
         law = law and chip.law is not None
 
         def compute() -> Sensitivities:
+            self._check(chip)
             return sensitivities(*self._steady(chip), friction, shapes, law)
 
         expansion: Sensitivities = compute_cached((self, chip_key(chip), friction, shapes, law), compute)
         return expansion
 
     def _steady(self, chip: Chip) -> tuple[System | GeneralisedSystem, Scales, Floats]:
-        """Equations of the chip, its scales and its fluxes (faces,) in m/s."""
-        if self.k not in (1, 2, 4):
-            raise FlowError(f"flow.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
-        _check(chip)
+        """Equations of a checked chip, its scales and its fluxes (faces,) in m/s."""
         scales = Scales.of(chip, self.k, self.convection)
         equations = system(chip, self.k) if chip.law is None else generalised_system(chip, chip.law, self.k)
         try:
@@ -100,6 +106,12 @@ class FlowSolver:
                 "check units of speed and viscosity, or set flow.convection = false"
             ) from None
         return equations, scales, flux
+
+    def _check(self, chip: Chip) -> None:
+        """Raise FlowError for numbers that can not be solved."""
+        if self.k not in (1, 2, 4):
+            raise FlowError(f"flow.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
+        _check(chip)
 
 
 def _check(chip: Chip) -> None:

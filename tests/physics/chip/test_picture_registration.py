@@ -9,7 +9,13 @@ import pytest
 
 from flowrec.core.errors import ChipError
 from flowrec.measure import wall_fit
-from flowrec.measure.picture_registration import fit_nearby, other_scale, overlay, register
+from flowrec.measure.picture_registration import (
+    fit_nearby,
+    orientation_by_image,
+    other_scale,
+    overlay,
+    register,
+)
 from flowrec.measure.wall_fit import Fitter
 from flowrec.measure.wall_search import Pose, WallMap
 from flowrec.physics.chip.chip import ChipSettings
@@ -153,3 +159,13 @@ def test_other_pictures_are_refused(monkeypatch):
             register(other, VESSELS, ABOUT, (False,))
     with pytest.raises(ChipError, match="is blank"):
         register(np.full(SIZE_PX[::-1], 200, np.uint8), VESSELS, ABOUT)
+
+
+def test_a_field_without_a_channel_has_no_walls_to_compare_though_the_image_is_dark_at_its_border():
+    mask = np.ones((96, 128), bool)
+    mask[[0, -1]] = False
+    image = np.full(mask.shape, 180, np.uint8)
+    image[[0, 1, -2, -1]] = 60
+    chip = replace(VESSELS, mask=mask, openings=(), um_per_px=2.0)
+    assert fit_nearby(image, chip, Calibration(2.0, (0.0, 0.0), 0.0)) is None
+    assert orientation_by_image(image, chip, Calibration(2.0, (0.0, 0.0), 0.0)).alike == ()

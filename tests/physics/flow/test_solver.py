@@ -176,6 +176,17 @@ def test_solid_and_ponds_stand_still(crossing):
     assert not field.velocity_um_s[3:8, 4:9].any()
 
 
+@pytest.mark.parametrize("k", [1, 2])
+def test_a_fluid_that_nothing_drives_stands_still_as_the_equations_say(crossing, k):
+    still = FlowSolver(k).solve(crossing.with_boundary([0.0, 0.0, 0.0, 0.0]))
+    assert not still.velocity_um_s.any() and not still.pressure_pa.any() and still.note == "residual below 1e-9"
+    barely = FlowSolver(k).solve(crossing.with_boundary([1e-9, 0.0, 0.0, 0.0]))
+    assert 0.0 < np.abs(barely.velocity_um_s).max() < 1e-8
+    assert np.array_equal(still.wall_px, barely.wall_px)
+    moved = FlowSolver(k).solve(crossing.with_boundary([0.0, 0.0, 3.0, 0.0]))  # a pressure alone
+    assert np.abs(moved.velocity_um_s).max() > 1.0
+
+
 def test_the_same_chip_gives_the_same_bytes_with_or_without_the_cache(crossing):
     chip = crossing.with_boundary([6000.0, 2000.0, 0.0, 0.0])
     first = FlowSolver().solve(chip)
