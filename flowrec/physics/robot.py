@@ -23,13 +23,15 @@ _Delay = Annotated[float, Range(0.0, 10.0)]
 class RobotSettings:
     """Section [robot] of a configuration. None: chosen to fit the chip when the configuration is resolved."""
 
-    # of the sphere, or of half of the longest side; walls are kept at least so far away
+    # radius of the sphere, or half of its longest side; walls are kept at least so far away. None: fits the channels
     radius_um: _Radius | None = None
-    um_per_rev: Annotated[float, Range(0.01, 1e5)] = 25.0  # k: distance rolled per revolution of the field
-    max_speed_um_s: _Speed | None = None  # largest speed relative to the fluid, v_max
-    step_out_hz: _Frequency | None = None  # frequency of the field above which the robot no longer follows it
+    um_per_rev: Annotated[float, Range(0.01, 1e5)] = 25.0  # distance k rolled per revolution of the field
+    # largest speed relative to the fluid, v_max. None: at least 1.3 times the peak of the assumed flow
+    max_speed_um_s: _Speed | None = None
+    # frequency of the field above which the robot no longer follows it. None: a fifth above that of v_max
+    step_out_hz: _Frequency | None = None
     step_out_margin: PositiveShare = 0.9  # fraction of the step-out frequency that is commanded at most
-    delay_s: _Delay | None = None  # time from command to motion
+    delay_s: _Delay | None = None  # time from command to motion. None: fits channels and speed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

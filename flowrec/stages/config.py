@@ -61,10 +61,11 @@ class WorkerSettings:
 class Recording:
     """Settings of the session file."""
 
-    frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"  # auto: by the camera's data rate
+    # encoding of the images; auto: by the camera's data rate
+    frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"
     # longest end of the session that is lost when the process is killed, in wall or session time
     flush_s: Annotated[float, Range(0.0, 3600.0)] = 0.5
-    sync_s: Annotated[float, Range(0.0, 3600.0)] = 1.0  # the same when the power fails
+    sync_s: Annotated[float, Range(0.0, 3600.0)] = 1.0  # longest end of the session that is lost when the power fails
     # robot: most images hold only what the tracker read, the rest is black; replays with the same tracker are exact
     region: Literal["whole", "robot"] = "whole"
     # interval of whole images with region = robot; images without the robot are always whole
@@ -76,9 +77,9 @@ class Recording:
     # Limit of the data that waits for the recorder; from half of it on, a live run records fewer frames. None: four
     # seconds of the camera's images, but 64 MB to 1.25 GB; in a live run all of it is taken before the run begins.
     queue_mb: Annotated[float, Range(1e-3, 1e6)] | None = None
-    # Size and duration after which a run continues in another file; None or 0: one file.
+    # Size after which a run continues in another file; None or 0: one file.
     split_mb: Annotated[float, Range(0.0, 1e9)] | None = None
-    # length of a part after which the next one begins. None: one file
+    # duration after which a run continues in another file. None: one file
     split_s: Annotated[float, Range(0.0, 1e7)] | None = None
     # Only this time before and after events is written. None: everything.
     snapshot_before_s: Annotated[float, Range(0.0, 1e6)] | None = None
@@ -87,15 +88,16 @@ class Recording:
     snapshot_mb: Annotated[float, Range(1e-3, 1e6)] = 1000.0
     # free space below which a run is ended as by Ctrl-C; 0: never
     disk_floor_gb: Annotated[float, Range(0.0, 1e6)] = 1.0
-    # In real time, before the file begins: the mission's methods are compiled, and for so long the camera's images are
-    # processed and written for trial, s. A machine that does not hold them is refused. 0: the run begins at once.
+    # Duration of the trial before the file of a live run begins: the mission's methods are compiled, and for so long
+    # the camera's images are processed and written. A machine that does not hold them is refused. 0: the run begins at
+    # once.
     admission_s: Annotated[float, Range(0.0, 60.0)] = 2.0
     # record also where the trial says that images will be lost, and go on when the recorder fails
     accept_losses: bool = False
     recover_leftovers: bool = True  # recover what killed runs have left in the same folder
     operator: str = ""  # person who ran it, for the record
     notes: str = ""  # free text, for the record
-    sample: str = ""  # of the experiment, for the record
+    sample: str = ""  # sample or experiment, for the record
     anonymous: bool = False  # do not record host, user, platform and local changes
 
 
@@ -111,8 +113,10 @@ class Config:
     """All settings of a run, one section per stage."""
 
     rig: Annotated[str, RIGS] = SIMULATED
-    duration_s: Annotated[float, Range(1e-3, 1e7)] | None = None  # None: until the mission is finished
-    topics: tuple[Annotated[str, TOPIC_ROWS], ...] = ()  # of other packages, recorded besides flowrec's own
+    # longest duration of the run; None: until the mission is finished
+    duration_s: Annotated[float, Range(1e-3, 1e7)] | None = None
+    # topics of other packages that are recorded besides flowrec's own
+    topics: tuple[Annotated[str, TOPIC_ROWS], ...] = ()
     chip: ChipSettings = field(default_factory=ChipSettings)
     robot: RobotSettings = field(default_factory=RobotSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)

@@ -52,14 +52,14 @@ PointUm = tuple[_Coordinate, _Coordinate]
 class CameraSettings:
     """Section [camera] of a configuration. None: chosen when the configuration is resolved."""
 
-    width_px: _Side = 640  # of an image
-    height_px: _Side = 512  # of an image
+    width_px: _Side = 640  # width of an image
+    height_px: _Side = 512  # height of an image
     bits: _Bits = 8  # depth of a pixel; grey levels are below 2^bits
-    rate_hz: _Rate | None = None  # None: chosen to fit the robot's speed
-    um_per_px: _Scale | None = None  # None: the whole chip fills the image
-    # Registration: how the chip lies in the image, and um_per_px. flowrec calibrate image measures them and writes a
-    # file; its settings go before those of this section.
-    registration: str = ""  # that file
+    rate_hz: _Rate | None = None  # images per second; None: chosen to fit the robot's speed
+    um_per_px: _Scale | None = None  # size of an image's pixel on the chip; None: the whole chip fills the image
+    # File of a registration, which states how the chip lies in the image, and um_per_px. flowrec calibrate image
+    # measures them and writes it; its settings go before those of this section.
+    registration: str = ""
     angle_deg: Angle = 0.0  # direction of the chip's x axis in the image: 0 right, 90 down
     mirror: bool = False  # the image shows the chip as in a mirror
     centre_um: PointUm | None = None  # chip point at the centre of the image; None: the centre of the chip
@@ -69,7 +69,7 @@ class CameraSettings:
     registered_from: str = ""  # file of the registration that was read, for the record
     # root mean square distance of the registered points from where the registration puts them
     residual_um: Annotated[float, Range(0.0, 1e6)] | None = None
-    # of an image; the robot is where it was in the middle of that time
+    # exposure time of an image; the robot is where it was in the middle of that time
     exposure_s: Annotated[float, Range(0.0, 10.0)] = 0.004
 
 
@@ -99,33 +99,35 @@ class Columns:
 
     # name of the column with the time; a number: that for all rows. None: found by its name
     time_s: Column | None = None
-    frequency_hz: Column | None = None  # of the rotation of the field
-    heading_deg: Column | None = None  # 0 to the right of the chip, 90 downwards; counted upwards: ["phi", -1.0]
-    amplitude_mt: Column | None = None  # of the rotating field
-    heading_rad: Column | None = None  # or in rad, as in applied.csv of flowrec export --format csv
-    i_x_a: Column | None = None  # or the currents
-    i_y_a: Column | None = None  # current of the coil pair along y
-    i_z_a: Column | None = None  # current of the coil pair along z
-    b_x_mt: Column | None = None  # or the field
-    b_y_mt: Column | None = None  # field along y
-    b_z_mt: Column | None = None  # field along z
+    frequency_hz: Column | None = None  # column of the frequency at which the field rotates, or a number
+    # column of the heading: 0 to the right of the chip, 90 downwards; counted upwards: ["phi", -1.0]
+    heading_deg: Column | None = None
+    amplitude_mt: Column | None = None  # column of the amplitude of the rotating field, or a number
+    heading_rad: Column | None = None  # column of the heading in rad, as in applied.csv of flowrec export --format csv
+    i_x_a: Column | None = None  # column of the current of the coil pair along x, where the log states currents
+    i_y_a: Column | None = None  # column of the current of the coil pair along y
+    i_z_a: Column | None = None  # column of the current of the coil pair along z
+    b_x_mt: Column | None = None  # column of the field along x, where the log states the field
+    b_y_mt: Column | None = None  # column of the field along y
+    b_z_mt: Column | None = None  # column of the field along z
 
 
 @dataclass(frozen=True, slots=True)
 class MovieSettings:
     """Section [movie]: the movie that the rig `movie` plays, and the log of what its coils did."""
 
-    path: str = ""  # of a file, or of a folder of images
-    reader: Annotated[str, MOVIE_READERS] | None = None  # None: by the content of the file
-    channel: Literal["red", "green", "blue", "grey"] | None = None  # what is used of a movie in colour
+    path: str = ""  # path of the movie: a file, or a folder of images
+    reader: Annotated[str, MOVIE_READERS] | None = None  # reader of the movie; None: by the content of the file
+    channel: Literal["red", "green", "blue", "grey"] | None = None  # colour channel that is used of a movie in colour
     bits: _Bits | None = None  # depth of the pixels, where the file does not tell it
     partial: bool = False  # a movie that breaks off is used up to there
     times: str = ""  # CSV with a column time_s, a row for each image; '': as the movie tells
-    rate_hz: Annotated[float, Range(1e-4, 1e6)] | None = None  # of the images, instead of their times
+    # images per second, where the movie does not tell their times, or instead of them
+    rate_hz: Annotated[float, Range(1e-4, 1e6)] | None = None
     coils: str = ""  # log of the coils, CSV or Excel; '': there is none
     drifts: bool = False  # nothing drives the body, so that without a log its motion is that of the flow
     columns: Columns = field(default_factory=Columns)
-    # Seconds of the log per second of the movie, and time of the log minus time of the movie at the first image.
+    # seconds of the log per second of the movie
     clock_rate: Annotated[float, Range(0.01, 100.0)] = 1.0
     # time of the log at the first image; an import finds it by the motion of the robot
     clock_offset_s: Annotated[float, Range(-1e10, 1e10)] = 0.0
@@ -140,10 +142,12 @@ class MovieSettings:
 class OutputLimits:
     """Section [lab.output]: limits of the coils besides those of [coils] and [coils.amplifier]."""
 
-    # largest rate of change of a coil's current, A/s; None: not limited
+    # largest rate of change of a coil's current; None: not limited
     slew_a_s: Annotated[float, Range(1e-3, 1e9)] | None = None
-    longest_on_s: Annotated[float, Range(0.1, 1e6)] = 3600.0  # for which the coils may be energised; then they rest
-    rest_s: Annotated[float, Range(1e-3, 1e6)] = 600.0  # after that time; a shorter rest gives back a part of it
+    # longest time for which the coils may be energised; then they rest
+    longest_on_s: Annotated[float, Range(0.1, 1e6)] = 3600.0
+    # time for which they rest then; a shorter rest gives back a part of it
+    rest_s: Annotated[float, Range(1e-3, 1e6)] = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +155,7 @@ class SerialPort:
     """Section [lab.serial]: the microcontroller of the amplifier `serial`."""
 
     port: str = ""  # serial port to which it is connected, such as '/dev/ttyACM0'
-    baud: Annotated[int, Range(9600, 12_000_000)] = 115_200  # a board with USB of its own ignores it
+    baud: Annotated[int, Range(9600, 12_000_000)] = 115_200  # bits per second; a board with USB of its own ignores it
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,14 +173,15 @@ class Lab:
     """Section [lab]: the devices of the rig `lab`. Image size, depth, rate and exposure are in [camera]."""
 
     camera: Annotated[str, CAMERAS] = "genicam"
-    device: str = ""  # of the camera: serial number, model, address or name; '': the only one there is
-    device_config: str = ""  # of the camera: configuration file, where the driver needs one
-    # upper left pixel of the image on the sensor; None: the image is in the middle of the sensor
+    device: str = ""  # which camera: serial number, model, address or name; '': the only one there is
+    device_config: str = ""  # configuration file of the camera, where the driver needs one
+    # column of the sensor at which the image begins; None: the image is in the middle of the sensor
     offset_x_px: Annotated[int, Range(0, 65_535)] | None = None
-    offset_y_px: Annotated[int, Range(0, 65_535)] | None = None  # likewise from the top
-    pixel_format: str = ""  # '': Mono8, Mono10, ... by camera.bits
-    gain: Annotated[float, Range(-100.0, 1e4)] | None = None  # in the camera's unit; None: as the camera has it
-    trigger: str = ""  # '': the camera runs freely; 'software'; else the line that triggers it, such as 'Line1'
+    # row of the sensor at which the image begins; None: the image is in the middle of the sensor
+    offset_y_px: Annotated[int, Range(0, 65_535)] | None = None
+    pixel_format: str = ""  # name of the pixel format; '': Mono8, Mono10, ... by camera.bits
+    gain: Annotated[float, Range(-100.0, 1e4)] | None = None  # gain in the camera's unit; None: as the camera has it
+    trigger: str = ""  # what triggers an image; '': the camera runs freely; 'software'; else the line, such as 'Line1'
     queue_frames: Annotated[int, Range(1, 1000)] = 8  # images that may wait for the loop; more are dropped and counted
     # time without an image after which the field is off until there is one again; less than safety.guard_timeout_s
     camera_timeout_s: Annotated[float, Range(0.01, 60.0)] = 0.3

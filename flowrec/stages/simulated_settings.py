@@ -47,12 +47,12 @@ class Simulated:
     are.
     """
 
-    world: Literal["kind", "moderate", "hard"] = "moderate"  # preset of the settings that are None: WORLDS
-    seed: Seed = 0  # of all that is drawn: world, noise, bodies
-    # The flow.
-    # each true inlet speed is the assumed one times 1 +- (a third of this to all)
+    # named world, from kind to hard: it states the settings of this section that are None
+    world: Literal["kind", "moderate", "hard"] = "moderate"
+    seed: Seed = 0  # seed of all that is drawn: world, noise, bodies
+    # Each true inlet speed is the assumed one times 1 +- (a third of this to all of it).
     inlet_speed_error: _PartOf | None = None
-    inlet_speed_share: _TrueOverAssumed | None = None  # true over assumed, of all; None: drawn
+    inlet_speed_share: _TrueOverAssumed | None = None  # ratio of all true inlet speeds to the assumed ones; None: drawn
     # each true outlet pressure differs by up to this fraction of the chip's pressure drop
     outlet_pressure_error: _Size | None = None
     viscosity_error: _PartOf | None = None  # the true viscosity is the assumed one times up to 1 +- this
@@ -65,50 +65,59 @@ class Simulated:
     # The true walls lie up to this far from those of the mask, in patches, in pixels of the mask. If it is not 0, or a
     # branch is blocked, the true flow is solved on a mask of half the pixel size, with these walls.
     wall_error_px: Annotated[float, Range(0.0, 1.5)] | None = None
-    blocked_share: Annotated[float, Range(0.0, 0.9)] | None = None  # of the width of one branch, at one place
-    # The pump: the true flow is the steady one times (1 + drift) (1 + pulsation_share sin(2 pi hz t + phase)).
-    drift_share: Annotated[float, Range(0.0, 0.3)] | None = None  # one sigma of the drift, a random process
+    # part of the width of one branch that is blocked, at one place
+    blocked_share: Annotated[float, Range(0.0, 0.9)] | None = None
+    # One standard deviation of the pump's drift, a random process. The true flow is the steady one times (1 + drift) (1
+    # + pulsation_share sin(2 pi hz t + phase)).
+    drift_share: Annotated[float, Range(0.0, 0.3)] | None = None
     drift_s: Annotated[float, Range(0.1, 1e5)] | None = None  # correlation time of the drift
     pulsation_share: _PartOf | None = None  # amplitude of the pump's pulsation, as a ratio of the inflow
-    pulsation_hz: _Rate | None = None  # None, also in the preset: drawn from 0.05 to 2, uniformly in the logarithm
-    pulsation_phase_deg: Angle | None = None  # likewise from 0 to 360
+    # frequency of the pump's pulsation; None, also in the preset: drawn from 0.05 to 2, uniformly in the logarithm
+    pulsation_hz: _Rate | None = None
+    # phase of the pump's pulsation; None, also in the preset: drawn from 0 to 360
+    pulsation_phase_deg: Angle | None = None
     k: Annotated[int, OneOf(1, 2, 4)] | None = None  # cells of the true flow per pixel side of the true walls' mask
-    # The robot.
-    um_per_rev_error: _PartOf | None = None  # true um per revolution: the assumed one times up to 1 +- this
-    um_per_rev_share: _TrueOverAssumed | None = None  # true over assumed; None: drawn
+    # True um per revolution: the assumed one times up to 1 +- this.
+    um_per_rev_error: _PartOf | None = None
+    # ratio of the true um per revolution to the assumed one; None: drawn
+    um_per_rev_share: _TrueOverAssumed | None = None
     slip: _PartOf | None = None  # fraction of the rolled distance that is lost; alone it is a smaller um per revolution
     # Drag of the side walls: 0 none, 1 as for a sphere (rigs/simulated/hindrance.py), on its own motion and on how the
     # flow carries it.
     hindrance: Share | None = None
     # random walk of the robot after one second, per axis, one sigma
     position_noise_um: Annotated[float, Range(0.0, 1e3)] | None = None
-    temperature_k: Annotated[float, Range(0.0, 1e3)] | None = None  # of the Brownian motion, which is added to it
+    # temperature of the fluid in K, which makes the robot's Brownian motion; it is added to that random walk
+    temperature_k: Annotated[float, Range(0.0, 1e3)] | None = None
     # deviation of the rolling direction from the heading: one sigma, correlated over a second
     heading_noise_rad: Annotated[float, Range(0.0, math.pi)] | None = None
-    speed_noise: Share | None = None  # relative deviation of the rolling speed, likewise
-    delay_error: _PartOf | None = None  # from command to motion: the robot's delay as assumed times up to 1 +- this
-    delay_s: Annotated[float, Range(0.0, 10.0)] | None = None  # None: drawn
+    speed_noise: Share | None = None  # relative deviation of the rolling speed: one sigma, correlated over a second
+    delay_error: _PartOf | None = None  # The true time from command to motion is the assumed one times up to 1 +- this.
+    delay_s: Annotated[float, Range(0.0, 10.0)] | None = None  # true time from command to motion; None: drawn
     step_out_error: _PartOf | None = None  # the true step-out frequency is the assumed one times up to 1 +- this
-    step_out_share: _TrueOverAssumed | None = None  # true over assumed; None: drawn
+    # ratio of the true step-out frequency to the assumed one; None: drawn
+    step_out_share: _TrueOverAssumed | None = None
     # each coil's true field per ampere differs by up to this fraction of itself, in each of the three directions
     coil_error: _PartOf | None = None
-    # The camera.
-    # Its true registration: shifted by half of to all of offset_px (camera pixels) in any direction, turned by up to
-    # angle_error_deg and scaled by up to 1 +- scale_error from that of [camera].
+    # The chip lies shifted in the image by half of this to all of it, in a drawn direction, from where [camera] puts
+    # it; turned by up to angle_error_deg, scaled by up to 1 +- scale_error.
     offset_px: Annotated[float, Range(0.0, 1e3)] | None = None
-    # by which the chip lies turned from where the registration puts it
+    # angle by which the chip lies turned at most from where the registration puts it
     angle_error_deg: Annotated[float, Range(0.0, 45.0)] | None = None
-    scale_error: _PartOf | None = None  # by which the image scale differs from the stated one, as a ratio
-    um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None  # None: drawn, as the next two
-    angle_deg: Angle | None = None  # true angle of the camera. None: the stated one and the error above
+    scale_error: _PartOf | None = None  # ratio by which the image scale differs at most from the stated one
+    # true size of an image's pixel on the chip; None: drawn
+    um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None
+    angle_deg: Angle | None = None  # true angle of the camera; None: drawn about the stated one
     # point of the chip that is truly in the middle of the image. None: by the stated registration
     centre_um: PointUm | None = None
-    mirror: bool | None = None  # None: as [camera] states it
+    mirror: bool | None = None  # the image truly shows the chip as in a mirror; None: as [camera] states it
     # The stage swings by this amplitude in a drawn direction, and the image with it.
     shake_um: Annotated[float, Range(0.0, 1e3)] | None = None
     shake_hz: _Rate | None = None  # mean frequency of the shaking of the image
     image: SimulatedImage = field(default_factory=SimulatedImage)
-    optics: Optics | None = None  # disc: the profile that the tracker fits; oblique: rigs/simulated/microscope.py
+    # how the robot is drawn: disc, the profile that the tracker fits; oblique, another look
+    # (rigs/simulated/microscope.py)
+    optics: Optics | None = None
     # relative rate error of the camera's clock; None: drawn, up to 50 either way
     clock_skew_ppm: Annotated[float, Range(-1e5, 1e5)] | None = None
     arrival_jitter_s: Annotated[float, Range(0.0, 1.0)] = 3e-4  # mean delay of a frame on its way to the host

@@ -27,12 +27,18 @@ def test_the_meaning_of_a_setting_is_the_comment_at_its_own_declaration() -> Non
     assert ROWS["plan.speed_share"].meaning == "ratio to the robot's speed limit; the rest is left to the controller"
     assert ROWS["plan.idle_speed_um_s"].meaning.startswith("swimming at this speed takes as much power")
     assert (ROWS["robot.delay_s"].unit, ROWS["robot.delay_s"].valid) == ("s", "number from 0 to 10")
+    assert ROWS["coils.amplifier.resistance_ohm"].unit == "ohm" and ROWS["recording.disk_floor_gb"].unit == "GB"
     assert ROWS["plan.policy_share"].read_by == ("time_field",) and ROWS["plan.speed_share"].read_by == ()
+
+
+def test_a_meaning_stands_alone_without_the_name_of_the_setting_or_its_neighbour() -> None:
+    leans_on_another = re.compile(r"(of|or|and|in|at|by|for|from|to|kept|likewise|the same|not set)\b", re.IGNORECASE)
+    assert [row.key for row in ROWS.values() if leans_on_another.match(row.meaning)] == []
 
 
 def test_a_value_that_is_not_there_has_one_name_for_people() -> None:
     assert ROWS["plan.idle_speed_um_s"].meaning.endswith("as everything else; not set: half of V")
-    assert ROWS["recording.split_s"].meaning.endswith("the next one begins. Not set: one file")
+    assert ROWS["recording.split_s"].meaning.endswith("another file. Not set: one file")
     assert ROWS["plan.idle_speed_um_s"].lines()[0] == "plan.idle_speed_um_s = (not set)"
     told = "\n".join([*(line for row in ROWS.values() for line in row.lines()), *settings().values()])
     assert "None" not in told

@@ -22,16 +22,20 @@ class ChipSettings:
     """Section [chip] of a configuration: a built-in chip by name, or a file; None keeps the value of that chip."""
 
     name: str = "bifurcation"  # bifurcation, straight, vessels
-    path: str = ""  # instead of the name: *.png (*.toml beside it), *.toml (*.png beside it) or *.npz vessel case
-    seed: Seed = 0  # of the vessels
-    um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None  # needed for a PNG that has no TOML
-    # smooth: a contour through the pixels of the mask; pixel: their edges. None: as the chip's file states
+    # file of the chip instead of a name: *.png (*.toml beside it), *.toml (*.png beside it) or *.npz vessel case
+    path: str = ""
+    seed: Seed = 0  # number of the drawn network that the name `vessels` stands for
+    # size of a pixel of the mask; needed for a PNG that has no TOML
+    um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None
+    # where the walls lie: smooth, on a contour through the pixels of the mask; pixel, on their edges. None: as the
+    # chip's file states
     walls: Walls | None = None
     # channel depth, for the depth-averaged friction; 0: two-dimensional
     depth_um: Annotated[float, Range(0.0, 1e5)] | None = None
-    # of the fluid; of one that is not Newtonian, the unit of its law. None: as the chip's file states
+    # viscosity of the fluid; of one that is not Newtonian, the unit of its law. None: as the chip's file states
     viscosity_mpa_s: Annotated[float, Range(1e-3, 1e5)] | None = None
-    density_kg_m3: Annotated[float, Range(1.0, 3e4)] | None = None  # of the fluid. None: as the chip's file states
+    # density of the fluid. None: as the chip's file states
+    density_kg_m3: Annotated[float, Range(1.0, 3e4)] | None = None
     # mean speed of the fastest inlet; the others keep their ratio to it
     inlet_speed_um_s: Annotated[float, Range(0.0, 1e7)] | None = None
     # Openings that are inlets, all others outlets at 0 Pa: "left:0" is the first on the left from the top,

@@ -257,16 +257,19 @@ class ViscositySettings:
 
     # how the viscosity depends on the shear rate. None: as the chip's file states
     law: Annotated[str, LAWS] | None = None
-    exponent: Annotated[float, Range(0.1, 3.0)] | None = None  # n; below 1: thinner at higher shear rates
+    # exponent n of the law; below 1: thinner at higher shear rates
+    exponent: Annotated[float, Range(0.1, 3.0)] | None = None
     rate_1_s: Annotated[float, Range(1e-6, 1e6)] | None = None  # shear rate at which viscosity_mpa_s holds
-    plateau_1_s: Annotated[float, Range(1e-9, 1e3)] | None = None  # below this shear rate the viscosity is constant
+    plateau_1_s: Annotated[float, Range(1e-9, 1e3)] | None = None  # shear rate below which the viscosity is constant
     time_s: Annotated[float, Range(1e-9, 1e6)] | None = None  # one over the shear rate at which thinning begins
     # viscosity at an infinite shear rate over that at rest
     infinite_share: Annotated[float, Range(0.0, 1e3)] | None = None
-    yasuda: Annotated[float, Range(0.1, 10.0)] | None = None  # a: how sharply thinning begins; 2: Carreau's law
+    # exponent a: how sharply thinning begins; 2: Carreau's law
+    yasuda: Annotated[float, Range(0.1, 10.0)] | None = None
     rates_1_s: Annotated[tuple[float, ...], Range(1e-9, 1e9)] | None = None  # shear rates of the table, ascending
-    ratios: Annotated[tuple[float, ...], Range(1e-9, 1e9)] | None = None  # viscosities over viscosity_mpa_s at them
-    function: str | None = None  # "module:name"
+    # viscosities at these rates, over viscosity_mpa_s
+    ratios: Annotated[tuple[float, ...], Range(1e-9, 1e9)] | None = None
+    function: str | None = None  # Python function of the shear rate, as "module:name"
 
 
 def law_of(settings: ViscositySettings, where: str) -> ViscosityLaw | None:

@@ -28,10 +28,10 @@ class FlowSolver:
     """
 
     k: Annotated[int, OneOf(1, 2, 4)] = 1  # subcells per pixel side: 1, 2 or 4
-    # of Newton's method; a flow that has not converged by then is an error
+    # largest number of iterations of Newton's method; a flow that has not converged by then is an error
     max_iterations: Annotated[int, Range(1, 10_000)] = 40
-    tolerance: Annotated[float, Range(1e-14, 0.1)] = 1e-9  # last Newton step over the fastest velocity
-    convection: bool = True  # False: Stokes flow
+    tolerance: Annotated[float, Range(1e-14, 0.1)] = 1e-9  # largest last Newton step, over the fastest velocity
+    convection: bool = True  # the fluid has inertia; False: Stokes flow
 
     def solve(self, chip: Chip) -> FlowField:
         """Flow on the pixels of the chip's mask for its boundary values; stamp and request are 0.

@@ -25,12 +25,13 @@ class AmplifierSettings:
     """
 
     kind: Literal["current", "voltage"] = "current"  # what the amplifier controls
-    a_per_v: Annotated[PerCoil, Range(1e-6, 1e6)] = (1.0, 1.0, 1.0)  # g of a current amplifier
+    a_per_v: Annotated[PerCoil, Range(1e-6, 1e6)] = (1.0, 1.0, 1.0)  # gain g of a current amplifier
     v_per_v: Annotated[PerCoil, Range(1e-6, 1e6)] = (1.0, 1.0, 1.0)  # gain of a voltage amplifier
-    # of each coil with its leads; used for a voltage amplifier
+    # resistance of each coil with its leads; used for a voltage amplifier
     resistance_ohm: Annotated[PerCoil, Range(0.0, 1e5)] = (2.0, 2.0, 2.0)
-    inductance_mh: Annotated[PerCoil, Range(0.0, 1e5)] = (5.0, 5.0, 5.0)  # of the coil pairs along x, y and z
-    max_voltage_v: Annotated[float, Range(1e-3, 1e4)] = 10.0  # of the outputs, not of the coils
+    # inductance of the coil pairs along x, y and z
+    inductance_mh: Annotated[PerCoil, Range(0.0, 1e5)] = (5.0, 5.0, 5.0)
+    max_voltage_v: Annotated[float, Range(1e-3, 1e4)] = 10.0  # largest voltage of the outputs, not of the coils
     output_hz: Annotated[float, Range(100.0, 1e7)] = 20_000.0  # samples per second of each output
 
     @property

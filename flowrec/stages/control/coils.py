@@ -32,15 +32,15 @@ class Coils:
 
     # roller: the field turns about an axis across the heading; helix: about the heading
     mode: Literal["roller", "helix"] = "roller"
-    surface: Literal["floor", "ceiling"] = "floor"  # on which a roller rolls
-    handedness: Literal["right", "left"] = "right"  # of a helix
-    amplitude_mt: Annotated[float, Range(1e-3, 1e3)] = 4.0  # B0
+    surface: Literal["floor", "ceiling"] = "floor"  # surface on which a roller rolls
+    handedness: Literal["right", "left"] = "right"  # handedness of a helix
+    amplitude_mt: Annotated[float, Range(1e-3, 1e3)] = 4.0  # amplitude B0 of the rotating field
     # field at the robot (rows) per coil current (columns)
     mt_per_a: Annotated[Matrix3, Range(-1e4, 1e4)] = ((2.1, 0.0, 0.0), (0.0, 1.9, 0.0), (0.0, 0.0, 1.5))
     # field without currents: of the earth and the microscope
     bias_mt: Annotated[PerCoil, Range(-1e3, 1e3)] = (0.0, 0.0, 0.0)
     max_current_a: Annotated[float, Range(1e-3, 1e3)] = 5.0  # largest current of a coil
-    ramp_s: Annotated[float, Range(0.0, 60.0)] = 0.2  # from zero to the full amplitude and back
+    ramp_s: Annotated[float, Range(0.0, 60.0)] = 0.2  # time from zero to the full amplitude and back
     amplifier: AmplifierSettings = field(default_factory=AmplifierSettings)
 
     def drive(

@@ -63,8 +63,8 @@ class Controller:
     """
 
     method: Annotated[str, CONTROLLERS] = "vector"
-    kp_per_s: Annotated[float, Range(0.0, 1e3)] = 3.0  # Kp of vector
-    ff_fb_kp_per_s: Annotated[float, Range(0.0, 1e3)] = 1.0  # Kp of the paper's laws, as in the paper
+    kp_per_s: Annotated[float, Range(0.0, 1e3)] = 3.0  # proportional gain Kp of vector
+    ff_fb_kp_per_s: Annotated[float, Range(0.0, 1e3)] = 1.0  # proportional gain Kp of the paper's laws, as in the paper
     # error of the robot up to which the reference keeps its planned pace
     lag_free_radii: Annotated[float, Range(0.0, 1e3)] = 0.5
     lag_full_radii: Annotated[float, Range(0.01, 1e3)] = 3.0  # error at which the reference stops and waits

@@ -66,10 +66,11 @@ class MissionStateMachine:
     Without a `goal` the robot comes back to its start after a survey, and goes to the outlet without one.
     """
 
-    phases: tuple[PhaseName, ...] = PHASES  # in order; observe is alone
+    phases: tuple[PhaseName, ...] = PHASES  # phases in their order; observe is alone
     # where the robot is at the beginning; on a lab's rig it is seen, and this is where it is looked for
     start: Place = "inlet"
-    # None: the start after a survey, so that the robot comes back; without one the widest outlet
+    # where the mission ends; None: at its start after a survey, so that the robot comes back; without one at the widest
+    # outlet
     goal: Place | None = None
     # Before anything is controlled, drive the robot a little along x and y, for at most 3 s, and refuse the run if it
     # does not move as the axes of camera and coils say; see control/axes_check.py. Record, import and doctor then also
@@ -78,7 +79,8 @@ class MissionStateMachine:
     # time from the first frame for which a pipette, a magnet or a pump that stands still holds the robot; the field is
     # on and the flow solved before it is let go. None: 1 s in the simulated rig at an outlet that `start` names, else 0
     hold_start_s: Annotated[float, Range(0.0, 3600.0)] | None = None
-    goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
+    # distance from the goal that counts as reached; None: the robot's radius
+    goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None
     survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0  # time after which a survey ends, wherever it is
     # time by which a robot may be late on its route, on top of what is usual, before it counts as stuck: a survey ends,
     # and the way to the goal is planned anew; 0: never. As long as a robot at its speed limit needs for a few widths of
@@ -96,7 +98,7 @@ class MissionStateMachine:
     reassimilate_observations: Annotated[int, Range(0, 1_000_000)] = 0
     # number of work orders after which a robot that is blown off its route once more gives up, but for routine ones
     orders_limit: Annotated[int, Range(1, 1_000_000)] = 20
-    # to see the robot for the first time, or again after the field was switched off
+    # longest time to see the robot for the first time, or again after the field was switched off
     find_limit_s: Annotated[float, Range(0.01, 1e5)] = 3.0
     # consecutive frames without the robot after which the run ends
     lost_limit_frames: Annotated[int, Range(1, 1_000_000_000)] = 90

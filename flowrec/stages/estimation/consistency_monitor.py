@@ -36,17 +36,18 @@ _SLOW_FRACTION = 0.1  # of v_max: a deviation relative to a slower flow is not m
 class HealthMonitor:
     """Settings of the alarms."""
 
-    window_s: Annotated[float, Range(0.05, 3600.0)] = 3.0  # of the means of NIS and of lost frames
+    window_s: Annotated[float, Range(0.05, 3600.0)] = 3.0  # duration over which NIS and lost frames are averaged
     # lowest frequency of a line that is looked for: that of the slowest syringe pumps. Its resonator needs the periods
     # below to swing up, so a line of 0.1 Hz and 30 % is an alarm after half a minute, not in a short survey.
     slowest_hz: Annotated[float, Range(0.01, 1.0)] = 0.05
-    # alarm if the mean NIS exceeds 2 by this many standard deviations of the mean of white innovations
+    # alarm if the mean NIS (normalised innovation squared) exceeds 2 by this many standard deviations of the mean of
+    # white innovations
     nis_sigma: Annotated[float, Range(0.1, 1e6)] = 8.0
     lost_share: Share = 0.3  # alarm above this fraction of frames without the robot
     # memory of a resonator in periods of its frequency; one second at least
     periods: Annotated[float, Range(0.5, 1e3)] = 2.0
     pulsation_share: Annotated[float, Range(1e-3, 1e3)] = 0.15  # alarm above this amplitude relative to the flow
-    line_share: Share = 0.5  # if the line is at least this fraction of the variance
+    line_share: Share = 0.5  # alarm only if the line is at least this fraction of the variance
     settle_s: Annotated[float, Range(0.0, 3600.0)] = 2.0  # the flow must have been accurate for this long
     # the spectrum is not updated while the flow's sigma exceeds this fraction of v_max
     settled_share: Annotated[float, Range(0.0, 10.0)] = 0.1

@@ -54,17 +54,20 @@ class Kalman:
 
     # one sigma of a measured position; None: 2 % of the radius
     position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
-    # q of a plain random walk of the flow in time, um2/s3; replaces the settings below up to `watch_radii`
+    # spectral density q of a plain random walk of the flow in time, um2/s3; replaces the settings below up to
+    # `watch_radii`
     flow_noise_um2_s3: Annotated[float, Range(0.0, 1e12)] | None = None
     flow_change: Share = 2e-3  # variance of the flow's change over one radius, relative to its squared speed
-    slope_change: Share = 2e-5  # the same for its gradient times the radius
+    # variance of the change of the flow's gradient times the radius over one radius, relative to its squared speed
+    slope_change: Share = 2e-5
     # error of a map, as a fraction of the flow and of its changes; None: from the map
     map_share: Annotated[float, Range(0.0, 10.0)] | None = None
     # factor on the variances of all changes: what `flowrec bench observer --session` tunes
     agility: Annotated[float, Range(1e-6, 1e6)] = 1.0
     # innovations are averaged over the time in which the robot covers this distance at v_max
     watch_radii: Annotated[float, Range(0.01, 1e3)] = 2.2
-    drift_um2_s: Annotated[float, Range(0.0, 1e6)] = 4.0  # of the position: Brownian motion and uneven rolling
+    # growth of the position's variance by Brownian motion and uneven rolling
+    drift_um2_s: Annotated[float, Range(0.0, 1e6)] = 4.0
     gate_nis: Annotated[float, Range(1.0, 1e9)] = 25.0  # a measurement with a larger NIS is not used at once
     # factor on the position's variance in that case, so that a real jump is soon accepted
     gate_growth: Annotated[float, Range(1.0, 1e6)] = 4.0

@@ -16,7 +16,7 @@ from flowrec.physics import Robot
 class Luenberger:
     """With xhat' = u + vhat it is a first-order low-pass filter of the measured drift, discretised exactly."""
 
-    gain_per_s: Annotated[float, Range(1e-3, 1e4)] = 1.0  # L_p, the same on both axes
+    gain_per_s: Annotated[float, Range(1e-3, 1e4)] = 1.0  # gain L_p, the same on both axes
     # one sigma, for the stated covariance only; None: 4 % of the radius
     position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
 

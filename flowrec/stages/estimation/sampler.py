@@ -42,11 +42,12 @@ class Trimmed:
     `over` = "survey" is the other interpretation.
     """
 
-    discarded_share: Annotated[float, Range(0.0, 0.49)] = 0.2  # fraction at the top, and the same at the bottom
+    # fraction of the observations discarded at the top, and the same at the bottom
+    discarded_share: Annotated[float, Range(0.0, 0.49)] = 0.2
     # values that are compared: of a window that slides along the way, or of the whole survey
     over: Literal["window", "survey"] = "window"
     window: Annotated[int, Range(1, 1001)] = 9  # observations along the way
-    degree: Annotated[int, Range(0, 9)] = 2  # of the polynomial in the distance travelled
+    degree: Annotated[int, Range(0, 9)] = 2  # degree of the polynomial in the distance travelled
 
     def treat(self, observations: Observations) -> Observations:
         """Smoothed observations at the same positions, without those that are not finite.
@@ -93,7 +94,7 @@ class Sampler:
     """
 
     spacing_radii: Annotated[float, Range(0.0, 1e3)] = 0.8  # least distance between observations, in robot radii
-    memories: Annotated[float, Range(0.0, 1e3)] = 2.0  # least time between them, in memories of the filter
+    memories: Annotated[float, Range(0.0, 1e3)] = 2.0  # least time between observations, in memories of the filter
     # no observation while the flow's sigma exceeds this fraction of the robot's top speed
     settled_share: Annotated[float, Range(0.0, 10.0)] = 0.1
     floor_um_s: Annotated[float, Range(1e-3, 1e4)] = 2.0  # least sigma of an observation
@@ -102,7 +103,8 @@ class Sampler:
     # take them from a filter that knows no map (`Observer.without_map`): a map is no measurement
     without_map: bool = True
     capacity: Annotated[int, Range(1, 100_000)] = 2000  # the oldest are dropped first
-    method: Annotated[str, SAMPLERS] = "filter"  # what a refinement is given
+    # which observations a refinement is given: as the filter made them, trimmed as in the paper, or smoothed afterwards
+    method: Annotated[str, SAMPLERS] = "filter"
     trimmed: Trimmed = field(default_factory=Trimmed)
 
     def treat(self, observations: Observations) -> Observations:

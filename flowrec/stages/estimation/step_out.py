@@ -41,13 +41,14 @@ _LEAST_STEP = 0.95  # a learned limit falls at least to this fraction of the one
 class StepOut:
     """Settings of the detection."""
 
-    window_s: Annotated[float, Range(0.05, 60.0)] = 0.5  # of the means, for a robot of up to 12 radii per second
+    # duration of the means, for a robot of up to 12 radii per second
+    window_s: Annotated[float, Range(0.05, 60.0)] = 0.5
     map_error: Share | None = None  # relative error of the map's flow; None: from the map
     missing_share: Share = 0.3  # fraction of the commanded motion that must be missing besides; 1: never limit
     learned: bool = True  # the limit is step_out_margin times what Adler's equation gives; False: lowered in steps
     lower_to: PositiveShare = 0.8  # factor on the frequency in one such step
     floor_share: PositiveShare = 0.3  # lowest limit, as a fraction of the robot's own
-    wait_s: Annotated[float, Range(0.0, 1e6)] = 10.0  # before another step after one that did not help
+    wait_s: Annotated[float, Range(0.0, 1e6)] = 10.0  # time before another step after one that did not help
 
     def _window_s(self, robot: Robot, dt: float) -> float:
         """`window_s`, shorter for a robot that is faster than it is meant for: it is carried away sooner."""

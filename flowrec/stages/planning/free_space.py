@@ -97,10 +97,10 @@ class FastFlowMargin:
 
     # ratio of the map's error to the flow's speed; None: from the map
     map_error: Annotated[float, Range(0.0, 10.0)] | None = None
-    # of the rolling direction: three standard deviations
+    # three standard deviations of the rolling direction
     heading_error_rad: Annotated[float, Range(0.0, 0.5 * math.pi)] = 0.1
-    frame_s: Annotated[float, Range(0.0, 10.0)] | None = None  # None: the camera's
-    latency_s: Annotated[float, Range(0.0, 10.0)] | None = None  # from command to motion; None: the robot's
+    frame_s: Annotated[float, Range(0.0, 10.0)] | None = None  # time between two images; None: the camera's
+    latency_s: Annotated[float, Range(0.0, 10.0)] | None = None  # time from command to motion; None: the robot's
 
     def course_error(self, robot: Robot, speed_um_s: float, field: FlowField | None = None) -> CourseError:
         """The course error of a robot that swims at a speed; without a field that of a map whose error is not known."""

@@ -89,8 +89,8 @@ class PlanningMethod(Protocol):
 class RrtSettings:
     """Settings of both trees."""
 
-    seed: Seed = 0  # of the branches
-    iterations: Annotated[int, Range(1, 100_000_000)] = 20000  # at most; rrt stops at its first path
+    seed: Seed = 0  # seed of the branches
+    iterations: Annotated[int, Range(1, 100_000_000)] = 20000  # largest number of branches; rrt stops at its first path
     range_px: Annotated[float, Range(0.1, 1e5)] = 12.0  # longest branch
     goal_bias: Share = 0.05  # fraction of the samples that are the goal itself
 
@@ -103,17 +103,16 @@ class Planner:
     cost: Literal["time", "energy"] = "time"  # what a route has least of; energy counts the swimming and the time
     # swimming at this speed takes as much power as everything else; None: half of V
     idle_speed_um_s: Annotated[float, Range(0.01, 1e6)] | None = None
-    # kept from the walls beside the robot's radius; None: half of it
+    # distance that is kept from the walls beside the robot's radius; None: half of the radius
     clearance_margin_um: Annotated[float, Range(0.0, 1e4)] | None = None
     swift: FastFlowMargin = setting(default_factory=FastFlowMargin)  # more is kept where the flow is fast
     speed_share: PositiveShare = 0.85  # ratio to the robot's speed limit; the rest is left to the controller
-    policy_share: PositiveShare = 1.0  # the same in the time to go: a policy keeps no reserve
-    # By how much a wall may lie elsewhere than where the robot is seen beside it: errors of the mask and of the
-    # registration. The time to go keeps that from the walls, at most the margin; None, not known: all of the margin
-    # (a run fills in the robot's radius, which is more).
-    # Upstream on procedural networks (`flowrec bench missions`, 6 seeds, assumed map) a fifth of the margin touched a
-    # wall in all 6 missions of `moderate`, whose registration is a pixel of the camera off; all of it in none, and it
-    # arrived earlier, because the walls slow a robot beside them.
+    policy_share: PositiveShare = 1.0  # ratio to the speed limit in the time to go: a policy keeps no reserve
+    # Distance by which a wall may lie elsewhere than where the robot is seen beside it: errors of the mask and of the
+    # registration. The time to go keeps that from the walls, at most the margin; None, not known: all of the margin (a
+    # run fills in the robot's radius, which is more). Upstream on procedural networks (`flowrec bench missions`, 6
+    # seeds, assumed map) a fifth of the margin touched a wall in all 6 missions of `moderate`, whose registration is a
+    # pixel of the camera off; all of it in none, and it arrived earlier, because the walls slow a robot beside them.
     wall_error_um: Annotated[float, Range(0.0, 1e4)] | None = None
     # Least ratio to the margin in the time to go. Against the flow the fastest way is along the wall, and a policy,
     # which no reference pulls there, keeps off it by itself; a robot that tracks a route needs all of the margin.
@@ -125,16 +124,17 @@ class Planner:
     policy_course_share: Share = 0.5
     # Points of the time to go per radius of the robot: against the flow the way along the wall lies between the pixels.
     policy_points_per_radius: Annotated[float, Range(0.1, 100.0)] = 10.0
-    policy_points_per_px: Annotated[int, Range(1, 16)] = 8  # at most, and as many as 2 million points in all allow
-    # of the flow, by which it may be worse than believed; fewer where no way is left
+    # most of these points per pixel; fewer where there would be over 2 million in all
+    policy_points_per_px: Annotated[int, Range(1, 16)] = 8
+    # standard deviations by which the flow may be worse than believed; fewer where no way is left
     robust_deviations: Annotated[float, Range(0.0, 100.0)] = 1.0
-    # one deviation of a flow that states none, as a ratio of its speed; None: from the map
+    # one standard deviation of a flow that states none, as a ratio of its speed; None: from the map
     flow_error_share: Annotated[float, Range(0.0, 10.0)] | None = None
-    # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
+    # reach of a step of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     reach_px: Annotated[int, OneOf(1, 2, 3)] = 3
-    paper_radius_px: Annotated[float, Range(1.0, 100.0)] = 3.5  # neighbours of astar_paper; 1.5 gives 8
-    refine: bool = True  # the path of time_field and astar_time
-    # on the way, another route is taken if it gains more than so many standard deviations of the gain
+    paper_radius_px: Annotated[float, Range(1.0, 100.0)] = 3.5  # reach of a step of astar_paper; 1.5 gives 8 neighbours
+    refine: bool = True  # refine the path of time_field and astar_time off the pixels
+    # standard deviations of the gain that another route must gain on the way to be taken
     replan_deviations: Annotated[float, Range(0.0, 100.0)] = 2.0
     rrt: RrtSettings = setting(default_factory=RrtSettings)
 

@@ -50,29 +50,34 @@ class SurveyPlanner:
     method: Annotated[str, SURVEYS] = "information"
     # length of the survey at most; None: `share` of the longest path downstream, or no limit of `information`
     distance_um: Annotated[float, Range(1.0, 1e7)] | None = None
-    # of `downstream`; None: 1/8; 1/2 where there are several inlets or outlets to tell apart
+    # length of a survey `downstream` over that of the longest path; None: 1/8; 1/2 where there are several inlets or
+    # outlets to tell apart
     share: PositiveShare | None = None
     # ratio to the robot's speed limit: slower than usual, to observe more on the way
     speed_share: PositiveShare = 0.5
-    clearance_margin_um: Annotated[float, Range(0.0, 1e4)] | None = None  # None: half of the robot's radius
+    # distance that is kept from the walls beside the robot's radius; None: half of the radius
+    clearance_margin_um: Annotated[float, Range(0.0, 1e4)] | None = None
     swift: FastFlowMargin = field(default_factory=FastFlowMargin)  # as in plan.swift
     # additional cost of a pixel next to the wall, as a ratio to that of one in the middle
     middle_pull: Annotated[float, Range(0.0, 1e3)] = 2.0
-    outlet_gap_radii: Annotated[float, Range(0.0, 1e3)] = 3.0  # between the end of the route and any opening
-    # Of `information`: other ratios to the speed limit at which a stretch may be travelled. A drift observes the flow
+    # distance between the end of the route and any opening, in robot radii
+    outlet_gap_radii: Annotated[float, Range(0.0, 1e3)] = 3.0
+    # another ratio to the speed limit at which a stretch of the survey may be travelled. A drift observes the flow
     # almost without the robot's own motion, so it is tried only where constants of the robot are in doubt.
     fast_share: PositiveShare = 0.85
-    drift_share: PositiveShare = 0.15  # likewise, where constants of the robot are in doubt
-    # Of the squared error that is to be lowered, the part that counts on the ways to the goal; the rest is the map's.
+    # another ratio to the speed limit, a drift, tried where constants of the robot are in doubt
+    drift_share: PositiveShare = 0.15
+    # part of the squared error to be lowered that counts on the ways to the goal; the rest counts all over the map
     route_share: Share = 0.5
     # A way to the goal that takes longer than the fastest by this ratio counts for a third of it.
     detour_share: Annotated[float, Range(0.01, 100.0)] = 0.5
-    # of the flow, by which it may be worse than believed where the goal must stay within reach; fewer where no way is
+    # standard deviations by which the flow may be worse than believed where the goal must stay within reach; fewer
+    # where no way is
     robust_deviations: Annotated[float, Range(0.0, 100.0)] = 1.0
-    # Of the speed of the flow, one standard deviation of what the model does not explain, the same all over a place:
-    # what is known as well as this is not looked at again.
+    # one standard deviation of what the model does not explain, as a ratio to the speed of the flow, the same all over
+    # a place: what is known as well as this is not looked at again
     model_share: Annotated[float, Range(0.0, 10.0)] = 0.05
-    places: Annotated[int, Range(1, 10_000)] = 120  # at most so many ends of a stretch are compared, per speed
+    places: Annotated[int, Range(1, 10_000)] = 120  # largest number of ends of a stretch that are compared, per speed
     # The survey ends when a crossing's time of it would lower the relative error of the flow by less than this.
     # Chosen against 0.02 on eight procedural vessels of `flowrec bench survey`, at equal count. Those have a mean error
     # of .0238 in 4.8 crossings without a memory, .0243 in 3.4 crossings with that of three stretches.

@@ -122,7 +122,7 @@ class Assimilate(PriorSettings):
     model: ModelError = field(default_factory=ModelError)
     doubt_walls: bool = True  # all walls may lie the same distance off
     doubt_depth: bool = True  # try depths where the chip states none
-    max_steps: Annotated[int, Range(1, 1_000)] = 8  # of the full equations with frozen factors
+    max_steps: Annotated[int, Range(1, 1_000)] = 8  # largest number of steps of the full equations with frozen factors
     tolerance: Annotated[float, Range(1e-12, 1.0)] = 2e-3  # last such step over the fastest speed
 
     def fit(self, problem: RefinementProblem) -> FlowField:

@@ -36,15 +36,16 @@ class ModelError:
     They hold for pixel walls as they are. Another wall treatment, or another k, needs a new fit.
     """
 
-    # of D that is added: 0.11 over 12 drawn vessels
+    # fraction of the difference D between two grids that is added to the flow: 0.11 over 12 drawn vessels
     share: Annotated[float, Range(0.0, 10.0)] = 0.11
     # standard deviation of the fraction: 0.03 from chip to chip, more from one solver to another
     share_std: Annotated[float, Range(0.0, 10.0)] = 0.15
-    # of D around a pixel: standard deviation of the error that remains there; 0.17 on those
+    # standard deviation of the error that remains, as a fraction of D around a pixel; 0.17 on those vessels
     left_share: Annotated[float, Range(0.0, 10.0)] = 0.2
-    # of the speed around a pixel: the same, where both grids agree by chance
+    # standard deviation of it as a fraction of the speed around a pixel, where both grids agree by chance
     speed_share: Annotated[float, Range(1e-6, 10.0)] = 0.003
-    # of the speed around a pixel: standard deviation of the whole error, where there is no coarser grid (k = 1)
+    # standard deviation of the whole error as a fraction of the speed around a pixel, where there is no coarser grid (k
+    # = 1)
     coarse_share: Annotated[float, Range(1e-6, 10.0)] = 0.02
 
     def of(self, chip: Chip, solver: FlowSolver, expansion: Sensitivities) -> GridError:

@@ -85,17 +85,19 @@ def adam(
 class NetworkSettings:
     """Settings of the fit of a U-Net to one case."""
 
-    observations: Literal["soft", "hard"] = "soft"  # hard: as in the paper, the pixel takes the measured value
+    # how the loss takes observations: soft, by their likelihood; hard, as in the paper, the pixel takes the measured
+    # value
+    observations: Literal["soft", "hard"] = "soft"
     # iterations times pixels in millions: larger fields get fewer iterations
     largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 4.0
     patience: Iterations = 25  # iterations without a better loss before it stops
-    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3  # of Adam
-    observation_weight: Weight = 0.03  # of the mean log-likelihood against the mean squared residual
-    base_channels: Annotated[int, Range(1, 512)] = 16  # of the network with random weights
-    device: Device = "cpu"  # that trains the network
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3  # learning rate of Adam
+    observation_weight: Weight = 0.03  # weight of the mean log-likelihood against the mean squared residual
+    base_channels: Annotated[int, Range(1, 512)] = 16  # channels of the first level of the network with random weights
+    device: Device = "cpu"  # device that trains the network
     # More than one only on idle cores: torch's threads wait actively, and on two shared cores two are ten times slower.
     threads: Threads = 1
-    seed: Seed = 0  # of the initial weights
+    seed: Seed = 0  # seed of the initial weights
 
 
 class FieldLoss:

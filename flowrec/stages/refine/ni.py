@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 class Ni(NetworkSettings):
     """Settings of N/I."""
 
-    iterations: Iterations = 150  # of the training
+    iterations: Iterations = 150  # iterations of the training
     largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 6.0
     patience: Iterations = 30
     observation_weight: Weight = 0.1

@@ -48,14 +48,17 @@ class Correction:
 class PiUnet(NetworkSettings):
     """Settings of the PI-UNet."""
 
-    start: Literal["assimilate", "fvm"] = "assimilate"  # the initial field
+    start: Literal["assimilate", "fvm"] = "assimilate"  # initial field
     obstacles: bool = True  # channels may be partly blocked; of the start "assimilate" only
     # The next two apply to the start "fvm". What remains of an assimilated field's misfit is not explained by boundary
     # values, which is what the weights have learned and the balance assumes.
     weights: Literal["vessels", "none"] = "vessels"  # trained on drawn vessels, or random ones as in the paper
-    finish: Literal["balance", "none"] = "balance"  # with soft observations
-    near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as in the paper, the initial values stay
-    # None: 80 with random weights, none with trained ones
+    # balance: with soft observations, physics, observations and boundary values are balanced directly, from the
+    # network's field; none: the field is the network's
+    finish: Literal["balance", "none"] = "balance"
+    # pixels next to a wall: scaled with the flow around them; hard, as in the paper, their initial values stay; free
+    near_wall: Literal["scaled", "hard", "free"] = "scaled"
+    # iterations of the training; None: 80 with random weights, none with trained ones
     iterations: Annotated[int, Range(0, 1_000_000)] | None = None
 
     @property

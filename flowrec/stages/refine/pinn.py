@@ -144,28 +144,28 @@ class PinnCase:
 class Pinn:
     """Settings of the PINN."""
 
-    iterations: Iterations = 1000  # of the training
+    iterations: Iterations = 1000  # iterations of the training
     # iterations without a loss that is lower by a hundredth before it stops
     patience: Iterations = 300
-    # in the fluid, drawn anew for every iteration; half as many on the walls
+    # points in the fluid, drawn anew for every iteration; half as many on the walls
     points: Annotated[int, Range(16, 1_000_000)] = 512
     width: Annotated[int, Range(1, 4_096)] = 64  # neurons of a hidden layer
     depth: Annotated[int, Range(1, 64)] = 4  # hidden layers
     features: Annotated[int, Range(1, 4_096)] = 64  # sines and cosines of the coordinates that the first layer sees
-    # of those, radians per median channel width, one standard deviation
+    # one standard deviation of their wavenumbers, in radians per median channel width
     wavenumber: Annotated[float, Range(1e-3, 1e3)] = 0.5
-    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3  # of Adam
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3  # learning rate of Adam
     momentum_weight: Weight = 0.1  # weights are those of mean squares
     continuity_weight: Weight = (
         30.0  # a leak is worse than a wrong force: it changes the flow of every branch behind it
     )
-    observation_weight: Weight = 10.0  # of the misfit of the observations in the loss
-    wall_weight: Weight = 10.0  # of the velocity at the walls in the loss
-    inlet_weight: Weight = 1.0  # of the misfit of the stated inflow in the loss
-    outlet_weight: Weight = 1.0  # of the misfit of the stated pressure at outlets in the loss
-    device: Device = "cpu"  # that trains the network
-    threads: Threads = 1  # of the processor
-    seed: Seed = 0  # of the initial weights
+    observation_weight: Weight = 10.0  # weight of the misfit of the observations in the loss
+    wall_weight: Weight = 10.0  # weight of the velocity at the walls in the loss
+    inlet_weight: Weight = 1.0  # weight of the misfit of the stated inflow in the loss
+    outlet_weight: Weight = 1.0  # weight of the misfit of the stated pressure at outlets in the loss
+    device: Device = "cpu"  # device that trains the network
+    threads: Threads = 1  # threads of the processor that train it
+    seed: Seed = 0  # seed of the initial weights
 
     def fit(self, problem: RefinementProblem) -> FlowField:
         """The network's values at pixel centres; of the assumed field only stamp and labels are used.

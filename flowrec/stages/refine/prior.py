@@ -15,15 +15,22 @@ from flowrec.physics import Chip
 class PriorSettings:
     """Widths of the prior, each one standard deviation."""
 
-    inlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.25  # of the assumed inlet speed
-    pump_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0  # the same, common to all inlets
-    outlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10  # of the largest assumed |pressure|
-    viscosity_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.30  # of the assumed viscosity
-    density_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10  # of the assumed density
-    depth_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0  # of the chip's depth, where it has one
-    # skew and flatness of the inlets' profiles, of the inlet speed
+    # standard deviation of an inlet's speed, as a fraction of the assumed one
+    inlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.25
+    # standard deviation of a factor that is common to all inlets
+    pump_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0
+    # standard deviation of an outlet's pressure, as a fraction of the largest assumed |pressure|
+    outlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10
+    # standard deviation of the viscosity, as a fraction of the assumed one
+    viscosity_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.30
+    # standard deviation of the density, as a fraction of the assumed one
+    density_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10
+    # standard deviation of the chip's depth, where it has one, as a fraction of it
+    depth_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0
+    # standard deviation of skew and flatness of the inlets' profiles, as a fraction of the inlet speed
     inlet_shape_std: Annotated[float, Range(0.0, 10.0)] = 0.0
-    # of the exponent of the chip's law of viscosity, where it has one; three times that of ln of its other unknowns
+    # standard deviation of the exponent of the chip's law of viscosity, where it has one; three times that of ln of its
+    # other unknowns
     law_std: Annotated[float, Range(0.0, 3.0)] = 0.15
 
 

@@ -103,7 +103,8 @@ class Refiner:
     # predicts: the flow in use stays where the refined one predicts observations that were held back worse, by more
     # than two standard errors; always: the refined one is adopted without a test
     adopt: Literal["predicts", "always"] = "predicts"
-    # False: nobody knows what part of the motion that was observed is the robot's own; nothing is refined
+    # the motion of the body tells the flow; False: nobody knows what part of it is the robot's own, and nothing is
+    # refined
     observes_flow: bool = True
     # Mission and controller place the robot on the chip by the registration that the refinement found.
     place_robot: bool = True

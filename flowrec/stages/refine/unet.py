@@ -25,8 +25,8 @@ class Unet:
     """Settings of the data-driven U-Net."""
 
     weights: str = ""  # path of a .safetensors file; '' for those that are shipped
-    device: Device = "cpu"  # that applies the network
-    threads: Threads = 1  # of the processor
+    device: Device = "cpu"  # device that applies the network
+    threads: Threads = 1  # threads of the processor that apply it
 
     @property
     def path(self) -> Path:

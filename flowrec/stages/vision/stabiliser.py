@@ -53,7 +53,8 @@ _ROBOT_RADII = 2.0  # around its last place pixels are not used
 class Stabiliser:
     """Measures the shift of each image; its memory is the previous Shift, and the Background."""
 
-    # None: on for a movie and a camera of a lab, off in a simulation, and in a session that does not state it
+    # compensate for a stage that shakes; None: on for a movie and a camera of a lab, off in a simulation, and in a
+    # session that does not state it
     on: bool | None = None
     # shift of the first image (columns, rows), which is the reference of the others; flowrec import measures it
     first_px: tuple[_Pixel, _Pixel] = (0.0, 0.0)

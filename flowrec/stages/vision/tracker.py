@@ -102,12 +102,14 @@ class _Scene:
 class Tracker:
     """Finds the robot; its memory is the previous Track, and the Appearance."""
 
-    # None: disc_or_look. A method of another package reads none of the settings below.
+    # method of the tracker; None: disc_or_look. A method of another package reads none of the settings below.
     method: Annotated[str, TRACKERS] | None = None
 
     least_score: Share = 0.55  # likeness times agreement of size, 0 to 1, for the robot while it is tracked
-    acquire_score: Share = 0.65  # the same if it was not seen on the frame before: more objects can be mistaken for it
-    acquire_likeness: Share = 0.82  # and the likeness alone: debris in contact may have its size, but not its shape
+    # least score of a robot that was not seen on the frame before: more objects can be mistaken for it
+    acquire_score: Share = 0.65
+    # least likeness alone in that case: debris in contact may have the robot's size, but not its shape
+    acquire_likeness: Share = 0.82
     least_contrast: Annotated[float, Range(0.0, 255.0)] = 6.0  # darkness of the robot in grey levels
     size_tolerance: Annotated[float, Range(0.01, 10.0)] = 0.25  # one sigma of ln(measured radius / expected radius)
     # search range around the last position in robot radii, besides what v_max permits
@@ -125,7 +127,8 @@ class Tracker:
     polarity: Polarity | None = None
     # a point (column, row) on the robot, whose look is learned there; robot.radius_um should reach its border
     click_px: tuple[_Pixel, _Pixel] | None = None
-    box_px: tuple[_Pixel, _Pixel, _Pixel, _Pixel] | None = None  # the same by a box around it: x0, y0, x1, y1
+    # a box around the robot, in place of a point: x0, y0, x1, y1
+    box_px: tuple[_Pixel, _Pixel, _Pixel, _Pixel] | None = None
     click_frame: Annotated[int, Range(0, 2**62)] | None = None  # index of the image of click_px; None: the first one
     # the walls of the mask may be off by this many robot radii; ignored where polarity is None
     wall_error_radii: Annotated[float, Range(0.0, 2.0)] = 0.5
