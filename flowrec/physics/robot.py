@@ -21,7 +21,7 @@ _Delay = Annotated[float, Range(0.0, 10.0)]
 
 @dataclass(frozen=True, slots=True)
 class RobotSettings:
-    """Section [robot] of a configuration. None: chosen to fit the chip when the configuration is resolved."""
+    """Size, response and limits of the robot; None: chosen to fit the chip when the configuration is resolved."""
 
     # radius of the sphere, or half of its longest side; walls are kept at least so far away. None: fits the channels
     radius_um: _Radius | None = None

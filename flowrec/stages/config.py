@@ -59,7 +59,7 @@ class WorkerSettings:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Settings of the session file."""
+    """The session file: encoding, what may be lost, parts, snapshots, notes."""
 
     # encoding of the images; auto: by the camera's data rate
     frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"
@@ -103,7 +103,7 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """The start of a run."""
+    """Another session from which a run takes its flow field."""
 
     field: str = ""  # session whose flow field is used instead of solving: survey once, navigate often
 

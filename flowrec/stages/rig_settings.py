@@ -50,7 +50,7 @@ PointUm = tuple[_Coordinate, _Coordinate]
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Section [camera] of a configuration. None: chosen when the configuration is resolved."""
+    """Images of the camera, and how the chip lies in them; None: chosen when the configuration is resolved."""
 
     width_px: _Side = 640  # width of an image
     height_px: _Side = 512  # height of an image
@@ -114,7 +114,7 @@ class Columns:
 
 @dataclass(frozen=True, slots=True)
 class MovieSettings:
-    """Section [movie]: the movie that the rig `movie` plays, and the log of what its coils did."""
+    """The movie that the rig `movie` plays, and the log of what its coils did."""
 
     path: str = ""  # path of the movie: a file, or a folder of images
     reader: Annotated[str, MOVIE_READERS] | None = None  # reader of the movie; None: by the content of the file
@@ -170,7 +170,7 @@ class NiOutputs:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """Section [lab]: the devices of the rig `lab`. Image size, depth, rate and exposure are in [camera]."""
+    """The devices of the rig `lab`. Image size, depth, rate and exposure are in [camera]."""
 
     camera: Annotated[str, CAMERAS] = "genicam"
     device: str = ""  # which camera: serial number, model, address or name; '': the only one there is

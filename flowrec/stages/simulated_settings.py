@@ -41,7 +41,7 @@ class SimulatedImage:
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """Section [simulated]: differences between the simulated and the assumed world, and noise; drawn from the seed.
+    """Differences between the simulated and the assumed world, and noise; drawn from the seed.
 
     "Up to 1 +- e" is uniform. Each error has random numbers of its own, so that to state one leaves the others as they
     are.

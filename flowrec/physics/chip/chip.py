@@ -19,7 +19,7 @@ WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
 
 @dataclass(frozen=True, slots=True)
 class ChipSettings:
-    """Section [chip] of a configuration: a built-in chip by name, or a file; None keeps the value of that chip."""
+    """The chip and its fluid: a built-in chip by name, or a file; None keeps the value of that chip."""
 
     name: str = "bifurcation"  # bifurcation, straight, vessels
     # file of the chip instead of a name: *.png (*.toml beside it), *.toml (*.png beside it) or *.npz vessel case

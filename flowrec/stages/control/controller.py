@@ -56,7 +56,7 @@ CONTROLLERS = Methods(
 
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """Settings of the control stage; `method` selects a row of CONTROLLERS.
+    """Steers the robot along its route; `method` selects a row of CONTROLLERS.
 
     Rates and times are meant for a robot that swims up to 12 of its radii per second. They are scaled for one that is
     faster, as far as the frame rate permits.

@@ -34,7 +34,7 @@ _SLOW_FRACTION = 0.1  # of v_max: a deviation relative to a slower flow is not m
 
 @dataclass(frozen=True, slots=True)
 class HealthMonitor:
-    """Settings of the alarms."""
+    """Alarms: the robot does not move as the model says, is not seen, or the pump pulsates."""
 
     window_s: Annotated[float, Range(0.05, 3600.0)] = 3.0  # duration over which NIS and lost frames are averaged
     # lowest frequency of a line that is looked for: that of the slowest syringe pumps. Its resonator needs the periods

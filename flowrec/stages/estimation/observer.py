@@ -46,7 +46,7 @@ OBSERVERS = Methods(
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """Settings of the observer stage; `method` selects a row of OBSERVERS."""
+    """Estimates position of the robot and flow around it; `method` selects a row of OBSERVERS."""
 
     method: Annotated[str, OBSERVERS] = "kalman_auto"
     kalman: Kalman = field(default_factory=Kalman)

@@ -97,7 +97,7 @@ class RrtSettings:
 
 @dataclass(frozen=True, slots=True)
 class Planner:
-    """Settings of all methods; a method reads those that its row in PLANNERS names, those of no row are for all."""
+    """Plans the route to the goal; a method reads the settings that its row in PLANNERS names, or no row does."""
 
     method: Annotated[str, PLANNERS] = "time_field"
     cost: Literal["time", "energy"] = "time"  # what a route has least of; energy counts the swimming and the time

@@ -45,7 +45,7 @@ SURVEYS = Methods(
 
 @dataclass(frozen=True, slots=True)
 class SurveyPlanner:
-    """Settings of all methods; a method reads those that its row in SURVEYS names."""
+    """Chooses where the robot observes the flow; a method reads the settings that its row in SURVEYS names."""
 
     method: Annotated[str, SURVEYS] = "information"
     # length of the survey at most; None: `share` of the longest path downstream, or no limit of `information`

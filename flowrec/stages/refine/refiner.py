@@ -97,7 +97,7 @@ class AssumedFlow:
 
 @dataclass(frozen=True, slots=True)
 class Refiner:
-    """Chooses the method. `ni` and `pinn` do not use the assumed field."""
+    """Refines the flow with observations; `method` selects how. `ni` and `pinn` do not use the assumed field."""
 
     method: Annotated[str, REFINERS] = "assimilate"
     # predicts: the flow in use stays where the refined one predicts observations that were held back worse, by more

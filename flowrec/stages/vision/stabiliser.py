@@ -51,7 +51,7 @@ _ROBOT_RADII = 2.0  # around its last place pixels are not used
 
 @dataclass(frozen=True, slots=True)
 class Stabiliser:
-    """Measures the shift of each image; its memory is the previous Shift, and the Background."""
+    """Measures the shift of each image of a shaking stage; its memory is the previous Shift, and the Background."""
 
     # compensate for a stage that shakes; None: on for a movie and a camera of a lab, off in a simulation, and in a
     # session that does not state it

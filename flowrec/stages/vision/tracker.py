@@ -100,7 +100,7 @@ class _Scene:
 
 @dataclass(frozen=True, slots=True)
 class Tracker:
-    """Finds the robot; its memory is the previous Track, and the Appearance."""
+    """Finds the robot in each image; its memory is the previous Track, and the Appearance."""
 
     # method of the tracker; None: disc_or_look. A method of another package reads none of the settings below.
     method: Annotated[str, TRACKERS] | None = None
