@@ -13,13 +13,13 @@ class Timing(Message):
     """Wall time of each part of this tick. Diagnostic: never compared."""
 
     stamp_ns: int
-    track_ms: float
-    observe_ms: float
-    control_ms: float
-    sinks_ms: float
-    total_ms: float
+    track_ms: Annotated[float, "wall time of tracking"]
+    observe_ms: Annotated[float, "wall time of the observer"]
+    control_ms: Annotated[float, "wall time of mission, controller, coils and rig"]
+    sinks_ms: Annotated[float, "wall time of handing the tick before this one over to recorder and viewer"]
+    total_ms: Annotated[float, "wall time of the whole tick"]
     queue_mb: Annotated[float, "data that waits for the disk"]
-    dropped_frames: int
+    dropped_frames: Annotated[int, "images not recorded so far"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,9 +27,9 @@ class Drops(Message):
     """Losses of a topic so far, written when they begin, change and end. Diagnostic."""
 
     stamp_ns: int
-    topic: str
-    by_backlog: Annotated[int, "not written because disk or processor was slower than the camera"]
-    by_camera: Annotated[int, "never delivered by the camera: gaps in the frame index"]
+    topic: Annotated[str, "topic that has losses"]
+    by_backlog: Annotated[int, "number not written because disk or processor was slower than the camera"]
+    by_camera: Annotated[int, "number never delivered by the camera: gaps in the frame index"]
     kept_every: Annotated[int, "from now on every n-th frame is written; 1: all"]
 
 
@@ -44,7 +44,7 @@ class Clocks(Message):
     wall_jumps: Annotated[int, "number of these steps"]
     passed_over: Annotated[int, "frames rejected because their stamp did not increase"]
     device: Annotated[int, "raw count of the camera's clock at its latest frame"]
-    arrival_ns: Annotated[int, "of that frame on the session clock"]
+    arrival_ns: Annotated[int, "stamp at which that frame arrived, on the session clock"]
     fitted_ns: Annotated[int, "predicted earliest arrival (lower envelope of the arrival times)"]
     rate: Annotated[
         float, "ns of the session clock per count: the fit is fitted_ns + rate (counts - device); 0: no clock"

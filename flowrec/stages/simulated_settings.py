@@ -115,8 +115,7 @@ class Simulated:
     shake_um: Annotated[float, Range(0.0, 1e3)] | None = None
     shake_hz: _Rate | None = None  # mean frequency of the shaking of the image
     image: SimulatedImage = field(default_factory=SimulatedImage)
-    # how the robot is drawn: disc, the profile that the tracker fits; oblique, another look
-    # (rigs/simulated/microscope.py)
+    # how the robot is drawn: disc, the profile that the tracker fits; oblique, lit from one side
     optics: Optics | None = None
     # relative rate error of the camera's clock; None: drawn, up to 50 either way
     clock_skew_ppm: Annotated[float, Range(-1e5, 1e5)] | None = None

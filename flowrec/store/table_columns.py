@@ -40,8 +40,8 @@ _KINDS = {int: "int64", float: "float64", bool: "bool", str: "string"}
 STAMP, TIME, WALL = "stamp_ns", "time_s", "wall_time"
 _COMMON = {
     STAMP: ("int64", "stamp of the message on the session clock"),
-    TIME: ("float64", "the same in s, as in Session.at"),
-    WALL: ("timestamp", "the same as time of day, UTC; empty in files that do not state when their clock was 0"),
+    TIME: ("float64", "stamp in s, as in Session.at"),
+    WALL: ("timestamp", "time of day of the stamp, UTC; empty in files that do not state when their clock was 0"),
 }
 
 _READ_WITH_PIXELS = ("index", "image")  # of a Frame

@@ -16,7 +16,7 @@ class Estimate(Message):
     """The observer's estimate of the robot and of the flow that carries it."""
 
     stamp_ns: int
-    position_um: Vector2
+    position_um: Annotated[Vector2, "estimated position of the robot"]
     flow_um_s: Annotated[Vector2, "the disturbance: flow velocity at the robot"]
     covariance: Annotated[
         Matrix,
@@ -25,20 +25,22 @@ class Estimate(Message):
     ]
     nis: Annotated[NanFloat, "normalised innovation squared; NaN on a frame without measurement"]
     measured_um: Annotated[Vector, Shape(2, finite=False), "last measured position that was used"]
-    seen: bool
+    seen: Annotated[bool, "the robot was seen in the image of this tick"]
     slopes_per_s: Annotated[
         Vector,
         Shape("n"),
-        "(3,) gradient of the flow at the robot: dvx/dx, dvx/dy, dvy/dx; dvy/dy = -dvx/dx. (0,): not known",
+        "gradient of the flow at the robot (3,): dvx/dx, dvx/dy, dvy/dx; dvy/dy = -dvx/dx. (0,): not known",
     ] = NOT_STATED
     surprise: Annotated[
-        Vector, Shape("m"), "(2,) sliding mean of the innovations, in standard deviations; (0,): not known"
+        Vector, Shape("m"), "sliding mean of the innovations (2,), in standard deviations; (0,): not known"
     ] = NOT_STATED
-    um_per_rev: Annotated[float | None, "of the robot; None: the nominal one is used"] = None
+    um_per_rev: Annotated[
+        float | None, "um per revolution of the robot as estimated; None: the nominal one is used"
+    ] = None
     rolled_um_s: Annotated[
         Vector,
         Shape("o"),
-        "(2,) the robot's own motion through the fluid, averaged over time as `flow_um_s` is; (0,): not known",
+        "the robot's own motion through the fluid (2,), averaged over time as `flow_um_s` is; (0,): not known",
     ] = NOT_STATED
 
 
@@ -55,7 +57,7 @@ class Health(Message):
     pulsation_share: Annotated[float, "amplitude of that line divided by the mean flow"]
     line_share: Annotated[float, "fraction of the flow's variance in that line, 0 to 1"]
     bank_re: Annotated[Vector, Shape("n"), "state of the resonators, relative to the mean flow; real part"]
-    bank_im: Annotated[Vector, Shape("n"), "imaginary part"]
+    bank_im: Annotated[Vector, Shape("n"), "state of the resonators, relative to the mean flow; imaginary part"]
     bank_power: Annotated[Vector, Shape("n"), "mean square of the input of each resonator"]
     mean_um_s: Annotated[Vector2, "mean flow"]
     offset_share: Annotated[float, "mean of the resonators' input, which is subtracted from it"]
@@ -73,8 +75,8 @@ class Health(Message):
     rolled_before_um_s: Annotated[
         Vector,
         Shape("o"),
-        "(2,) um/s rolled and um/s expected from the revolutions, just before the limit was lowered; (0,): no limit to "
-        "test",
+        "um/s rolled and um/s expected from the revolutions (2,), just before the limit was lowered; (0,): no limit "
+        "to test",
     ] = NOT_STATED
 
 
@@ -87,8 +89,8 @@ class Observations(Message):
     """
 
     stamp_ns: int
-    position_um: Annotated[Matrix, Shape("n", 2)]
-    flow_um_s: Annotated[Matrix, Shape("n", 2)]
+    position_um: Annotated[Matrix, Shape("n", 2), "places of the observations"]
+    flow_um_s: Annotated[Matrix, Shape("n", 2), "flow observed at them"]
     std_um_s: Annotated[Vector, Shape("n"), "one standard deviation per component"]
     rolled_um_s: Annotated[
         Matrix | None,
@@ -96,8 +98,14 @@ class Observations(Message):
         "um_per_rev times revolutions per second along the heading, a mean over the time that the flow is a mean of; "
         "None: not stated",
     ] = None
-    time_s: Annotated[Vector | None, Shape("n"), "middle of that time on the session clock; None: not stated"] = None
-    radius_um: Annotated[float | None, "of the robot, which the flow carries as a sphere; None: not stated"] = None
+    time_s: Annotated[
+        Vector | None,
+        Shape("n"),
+        "middle of the time over which the flow is a mean, on the session clock; None: not stated",
+    ] = None
+    radius_um: Annotated[float | None, "radius of the robot, which the flow carries as a sphere; None: not stated"] = (
+        None
+    )
 
     def only(self, which: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some of the observations, chosen by an index of arrays."""

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from flowrec.core.declarations import NOT_STATED, Image, Message, NanFloat, PerCoil, Shape, Vector, Vector2
+from flowrec.core.enums import Action
 from flowrec.core.errors import RigError
 
 PIXEL_BITS = (8, 10, 12, 14, 16)
@@ -29,7 +30,7 @@ class Frame(Message):
     """
 
     stamp_ns: int
-    index: int
+    index: Annotated[int, "number of the image by the camera's count"]
     image: Annotated[Image, Shape("h", "w"), "grey levels"]
     bits: Annotated[int, "depth of the camera's pixels: 8, 10, 12, 14 or 16"] = 8
 
@@ -64,9 +65,9 @@ class Applied(Message):
     """State of the coils up to this frame, read back from the rig; the command is in `Currents`."""
 
     stamp_ns: int
-    frequency_hz: Annotated[float, "of the rotating field, now"]
-    heading_rad: float
-    amplitude_mt: float
+    frequency_hz: Annotated[float, "frequency of the rotating field, now"]
+    heading_rad: Annotated[float, "heading of the field, now"]
+    amplitude_mt: Annotated[float, "amplitude of the field, now"]
     currents_a: Annotated[PerCoil, "current of each coil, now; of three coils x, y, z"]
     turns: Annotated[
         Vector2,
@@ -101,10 +102,10 @@ class OperatorEvent(Message):
     """An action of the operator."""
 
     stamp_ns: int
-    action: Annotated[str, "enums.Action"]
-    text: str
-    goal_um: Annotated[Vector, Shape("n"), "(2,) of goal; (0,) of others"] = NOT_STATED
-    speed_limit_um_s: Annotated[float | None, "of speed; None: the limit is taken away"] = None
+    action: Annotated[str, f"action of the operator: {', '.join(Action)}"]
+    text: Annotated[str, "text of a mark or a note"]
+    goal_um: Annotated[Vector, Shape("n"), "goal (2,) of the action goal; (0,) of others"] = NOT_STATED
+    speed_limit_um_s: Annotated[float | None, "limit of the action speed; None: the limit is taken away"] = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +113,7 @@ class Truth(Message):
     """Ground truth of a simulated rig. Recorded for evaluation; no stage reads it."""
 
     stamp_ns: int
-    position_um: Vector2
+    position_um: Annotated[Vector2, "true position of the robot"]
     flow_um_s: Annotated[Vector2, "true flow at the robot"]
-    clearance_um: Annotated[NanFloat, "from the robot's surface to the nearest wall"]
+    clearance_um: Annotated[NanFloat, "distance from the robot's surface to the nearest wall"]
     contacts: Annotated[int, "wall contacts so far"]

@@ -58,20 +58,22 @@ class FlowField(Message):
         )
 
     stamp_ns: int
-    request: int
-    method: Annotated[str, "fvm, assimilate, pi_unet, ..."]
-    um_per_px: float
-    velocity_um_s: Annotated[Raster, Shape("h", "w", 2), "x then y, at pixel centres; 0 in solid"]
-    pressure_pa: Annotated[Raster, Shape("h", "w"), "0 in solid"]
+    request: Annotated[int, "number of the work order that it answers"]
+    method: Annotated[str, "method that made it: fvm, assimilate, pi_unet, ..."]
+    um_per_px: Annotated[float, "size of a pixel of the chip"]
+    velocity_um_s: Annotated[Raster, Shape("h", "w", 2), "velocity at the pixel centres, x then y; 0 in solid"]
+    pressure_pa: Annotated[Raster, Shape("h", "w"), "pressure at the pixel centres; 0 in solid"]
     std_um_s: Annotated[
         Raster | None,
         Shape("h", "w", 2),
         "One standard deviation of each component; None if the method does not estimate it.",
     ]
-    boundary_values: Annotated[Vector, Shape("n"), "of inlets: mean inward speed, um/s; of outlets: pressure, Pa"]
-    viscosity_mpa_s: float
-    density_kg_m3: float
-    note: Annotated[str, "human-readable remark of the method on its result"]
+    boundary_values: Annotated[
+        Vector, Shape("n"), "boundary values of the openings; inlets: mean inward speed, um/s; outlets: pressure, Pa"
+    ]
+    viscosity_mpa_s: Annotated[float, "viscosity of the fluid"]
+    density_kg_m3: Annotated[float, "density of the fluid"]
+    note: Annotated[str, "remark of the method on its result, human-readable"]
     wall_px: Annotated[
         Raster | None,
         Shape("h", "w"),
@@ -88,8 +90,8 @@ class FlowField(Message):
         'What the refinement found besides the boundary values and the fluid: "; " between the names, one value and '
         "one standard deviation per name. The names are listed in stages/refine/causes.py.",
     ] = ""
-    parameters: Annotated[Vector, Shape("m")] = NOT_STATED
-    parameter_std: Annotated[Vector, Shape("m")] = NOT_STATED
+    parameters: Annotated[Vector, Shape("m"), "values of parameter_names"] = NOT_STATED
+    parameter_std: Annotated[Vector, Shape("m"), "one standard deviation of each"] = NOT_STATED
     viscosity_law: Annotated[
         str,
         "How the viscosity over viscosity_mpa_s depends on the shear rate, for people; the chip holds the law. '': it "
@@ -108,12 +110,11 @@ class FlowField(Message):
     ] = ""
     log_score: Annotated[
         float | None,
-        "Mean ln probability density, per observation and in 1/(um/s)^2, of observations that were held back: under "
-        "the flow that was ordered, under the flow in use before it, and one standard error of their difference. None: "
-        "not tested. See stages/refine/held_back.py.",
+        "mean ln probability density, per observation and in 1/(um/s)^2, of observations that were held back, under "
+        "the flow that was ordered; None: not tested. See stages/refine/held_back.py.",
     ] = None
-    log_score_before: float | None = None
-    log_score_error: float | None = None
+    log_score_before: Annotated[float | None, "such a mean under the flow in use before it"] = None
+    log_score_error: Annotated[float | None, "one standard error of the difference of the two"] = None
 
     def parameter(self, name: str) -> tuple[float, float] | None:
         """Value and standard deviation of something that the refinement found; None if it says nothing of it."""
@@ -264,12 +265,12 @@ class Route(Message):
     """A path with the time at which each point should be passed, or the reason why no path exists."""
 
     stamp_ns: int
-    request: int
-    method: str
-    reachable: bool
-    reason: Annotated[str, "why not, when it is not"]
-    waypoints_um: Annotated[Matrix, Shape("n", 2), "n = 0 when unreachable"]
-    arrival_s: Annotated[Vector, Shape("n"), "since the start of the route, strictly increasing"]
+    request: Annotated[int, "number of the work order that it answers"]
+    method: Annotated[str, "method that planned it"]
+    reachable: Annotated[bool, "a path exists"]
+    reason: Annotated[str, "reason why no path exists"]
+    waypoints_um: Annotated[Matrix, Shape("n", 2), "points of the path; none when the goal is unreachable"]
+    arrival_s: Annotated[Vector, Shape("n"), "time of each point since the start of the route, strictly increasing"]
     time_to_go_s: Annotated[
         Raster | None,
         Shape("h", "w", finite=False),
@@ -298,7 +299,7 @@ class Route(Message):
     goal_um: Annotated[
         Vector,
         Shape("q"),
-        "(2,) the goal that was asked for, which its last point may be near only; (0,): none, or not stated",
+        "goal that was asked for (2,), which its last point may be near only; (0,): none, or not stated",
     ] = NOT_STATED
     refused: Annotated[
         str,

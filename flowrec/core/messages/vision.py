@@ -13,11 +13,11 @@ class Track(Message):
     """Position of the robot in one image; the last known one if it was not seen."""
 
     stamp_ns: int
-    seen: bool
-    position_um: Vector2
+    seen: Annotated[bool, "the robot was seen in this image"]
+    position_um: Annotated[Vector2, "position of the robot; the last known one if it was not seen"]
     score: Annotated[float, "0 to 1, similarity to the robot's appearance"]
-    lost_frames: Annotated[int, "in a row"]
-    radius_px: Annotated[float, "of the robot's image, low-pass filtered"]
+    lost_frames: Annotated[int, "number of images in a row without the robot"]
+    radius_px: Annotated[float, "radius of the robot's image, low-pass filtered"]
     roi_px: Annotated[Vector, Shape(4), "x0, y0, x1, y1 of the searched region"]
     seen_ns: Annotated[int | None, "stamp of the latest frame in which it was seen; None: never, or not recorded"] = (
         None
@@ -25,7 +25,7 @@ class Track(Message):
     velocity_px_s: Annotated[
         Vector,
         Shape("n"),
-        "Motion of a robot that is tracked by its learned appearance, and the objects around it. (2,) mean; (0,): none",
+        "mean velocity (2,) of a robot that is tracked by its learned appearance; (0,): none",
     ] = NOT_STATED
     spread_px: Annotated[float, "mean distance from where it was expected"] = 0.0
     energy: Annotated[float, "mean of its squared foreground, in units of the noise's variance"] = 0.0
@@ -38,17 +38,19 @@ class Appearance(Message):
 
     stamp_ns: int
     polarity: Annotated[str, "dark, bright or mixed, relative to the background"]
-    noise: Annotated[float, "of a pixel, one standard deviation in grey levels"]
-    foreground_noise: Annotated[float, "of the foreground (stages/vision/foreground.py), likewise"]
-    radius_px: Annotated[float, "of the object in `views`, in camera px"]
-    centre_px: Annotated[Vector2, "where it was when it was learned"]
+    noise: Annotated[float, "noise of a pixel, one standard deviation in grey levels"]
+    foreground_noise: Annotated[
+        float, "noise of the foreground (stages/vision/foreground.py), one standard deviation in grey levels"
+    ]
+    radius_px: Annotated[float, "radius of the object in `views`, in camera px"]
+    centre_px: Annotated[Vector2, "place of the object when it was learned"]
     views: Annotated[
         Raster,
         Shape("n", "p", "p"),
         "Foreground around the centre, in blocks of whole camera pixels: the first look, a slow mean, other looks. n = "
         "0: nothing was learned, the robot is a disc.",
     ]
-    note: Annotated[str, "why nothing was found at the given place"] = ""
+    note: Annotated[str, "reason why nothing was found at the given place"] = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +64,7 @@ class Background(Message):
         "Column, row, grey level, and the change of the grey level per pixel along columns and rows. n = 0: the image "
         "shows no structure of the solid, so no shift can be measured.",
     ]
-    noise: Annotated[float, "of a pixel, one standard deviation in grey levels"]
+    noise: Annotated[float, "noise of a pixel, one standard deviation in grey levels"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

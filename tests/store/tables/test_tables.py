@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.declarations import as_read, message_fields
+from flowrec.core.declarations import as_read, message_fields, summary_of
 from flowrec.core.errors import SessionError
 from flowrec.core.messages import Applied, Currents, Estimate
 from flowrec.core.topics import BY_FIELD, TOPICS, Tick
@@ -53,6 +54,12 @@ def differences(topic: str, rows: list[dict[str, Any]], messages: list[Any]) -> 
                 if not same(row[column.name], value):
                     found.append(f"{topic}.{column.name}: {row[column.name]} where {value} belongs")
     return found
+
+
+def test_the_meaning_of_a_column_is_its_own_and_not_that_of_its_topic_or_a_part_of_a_sentence() -> None:
+    for topic in TOPICS:
+        leans = re.compile(rf"([xyz]: )?({re.escape(summary_of(topic.type))}|of|the same|where|enums|None|NaN)\b")
+        assert [column.name for column in columns_of(topic.field) if leans.match(column.meaning)] == []
 
 
 READ = [topic.field for topic in TOPICS if topic.field != "frame"]
@@ -136,7 +143,7 @@ def test_every_column_has_a_meaning_and_the_unit_that_its_name_ends_in() -> None
         assert len(set(names)) == len(names)
     meanings = {each.name: each.meaning for each in message_fields(Estimate)}
     assert meanings["flow_um_s"] == "the disturbance: flow velocity at the robot"
-    slopes = "(3,) gradient of the flow at the robot: dvx/dx, dvx/dy, dvy/dx; dvy/dy = -dvx/dx. (0,): not known"
+    slopes = "gradient of the flow at the robot (3,): dvx/dx, dvx/dy, dvy/dx; dvy/dy = -dvx/dx. (0,): not known"
     assert meanings["slopes_per_s"] == slopes
     units = [unit_of(name) for name in ("x_um", "u_um_s", "stamp_ns", "viscosity_mpa_s", "nis", "wall_time", "gas")]
     assert units == ["um", "um/s", "ns", "mPa*s", "", "", ""]
