@@ -64,7 +64,7 @@ from .refine.pi_unet import PiUnet as PiUnet
 from .refine.refiner import REFINERS as REFINERS, Refiner as Refiner, keep_flow as keep_flow
 from .refine.residuals import Physics as Physics
 from .refine.weights import write_weights as write_weights
-from .resolve import derived_values as derived_values, resolve as resolve, not_measured as not_measured
+from .resolve import derived_values as derived_values, resolve as resolve, not_measured as not_measured, refuse_unseen as refuse_unseen
 from .rig_settings import (
     AMPLIFIERS as AMPLIFIERS, CAMERAS as CAMERAS, CameraSettings as CameraSettings, LAB as LAB, Lab as Lab,
     MOVIE as MOVIE, MovieSettings as MovieSettings, OutputLimits as OutputLimits, RIGS as RIGS,

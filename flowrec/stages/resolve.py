@@ -34,6 +34,7 @@ _MAY_BE_NONE = ("camera.centre_um", "camera.residual_um")  # None is a value
 _ONLY_FOR_DRIVING = ("robot.max_speed_um_s", "robot.step_out_hz", "robot.delay_s")
 _USUAL_UM_S = 600.0  # top speed of a robot of which none is stated
 _HOLD_START_S = 1.0  # the ramp of the coils and the first solution of the flow take less
+_LEAST_RADIUS_PX = 0.3  # a smaller bead may show as a spot of its blur, but is more often one of a wrong scale
 _PLACE_RADII = 5.0  # from a named opening into the chip
 _OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
@@ -58,6 +59,7 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     check_config(config)
     _refuse_simulated(config)
     _refuse_unmeasured(config)
+    refuse_unseen(config)
     _refuse_survey_share(config)
     robot, camera = _fit_to_chip(config, chip)
     swift = {"frame_s": round(1.0 / camera.rate_hz, 6), "latency_s": robot.delay_s}
@@ -110,6 +112,20 @@ def not_measured(config: Config) -> list[str]:
     given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
     needless = (*_MAY_BE_NONE, *(_ONLY_FOR_DRIVING if config.mission.observes else ()))
     return [key for key, value in given.items() if value is None and key not in needless]
+
+
+def refuse_unseen(config: Config) -> None:
+    """Raise UsageError where the images of a real rig can not show its robot; often the scale is upside down."""
+    um_per_px, radius_um, camera = config.camera.um_per_px, config.robot.radius_um, config.camera
+    if config.rig == SIMULATED or um_per_px is None or radius_um is None:
+        return
+    radius_px, most_px = radius_um / um_per_px, 0.5 * max(camera.width_px, camera.height_px)
+    if not _LEAST_RADIUS_PX <= radius_px <= most_px:
+        why = "an image can not show it" if radius_px < 1.0 else "it is larger than the image"
+        raise UsageError(
+            f"robot.radius_um = {radius_um:g} is {radius_px:.2g} px at camera.um_per_px = {um_per_px:g}: {why}; correct "
+            f"one of them (if a um is {um_per_px:g} px, camera.um_per_px is {1.0 / um_per_px:.4g})"
+        )
 
 
 def _refuse_unmeasured(config: Config) -> None:

@@ -110,8 +110,8 @@ def _refuse_doubtful(fit: MotionFit, prepared: Prepared) -> None:
     if may_be_image(found, image, prepared.config, prepared.chip):
         raise turned_log(found, image, prepared.config, prepared.chip)
     warn(
-        f"the robot moves {found.name}, relative to the log, which is read so: {image.text}; the columns can state it "
-        "(flowrec settings movie.columns)"
+        f"the headings of the log are read {found.name}: so the robot moves, and {image.text}; nothing is to be done, "
+        "and movie.columns can state it (flowrec settings movie.columns)"
     )
 
 

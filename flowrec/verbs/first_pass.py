@@ -130,6 +130,8 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
         asked = _with_chosen_body(asked, p, *seen, robot, folder)
     click = asked.tracker
     p = replace(p, tracker=replace(p.tracker, click_px=click.click_px, click_frame=click.click_frame))
+    if place_px is not None:
+        _refuse_empty(robot, p, movie, prepared)
     shifts_px, tracks = _look_through(p, movie, prepared)
     facts: Mapping[str, str] = {}
     if p.stabiliser.on:
@@ -139,6 +141,15 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
             by_um = p.calibration.to_um(first_px) - p.calibration.to_um(asked.stabilise.first_px)
             tracks = tracks._replace(positions_um=tracks.positions_um + by_um)
     return Looked(asked, facts, prepared, tracks)
+
+
+def _refuse_empty(robot: str, p: Pipeline, movie: MovieSettings, prepared: Prepared) -> None:
+    """Raise UsageError where the first image shows no body at the place that was given."""
+    with MovieSource(movie, prepared.config.coils) as source:
+        sight = look(p, Sight(), next(iter(_within(source, prepared))))
+    if sight.appearance is not None and sight.appearance.note:
+        told = sight.appearance.note.replace("tracker.click_px =", "the pixels")
+        raise UsageError(f"--robot {robot}: {told}")
 
 
 def _first_seen(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> tuple[Frame, Sight] | None:
@@ -251,11 +262,18 @@ def _with_chosen_body(asked: Config, p: Pipeline, image: Frame, sight: Sight, ro
         x, y = places[number - 1].round(2).tolist()
         return replace(asked, tracker=replace(asked.tracker, click_px=(x, y), click_frame=image.index))
     count = f"at least {len(places)}" if len(places) >= MOST - 4 else len(places)  # near the limit some are left out
+    factor = _factor(image.image)
     picture = write_picture(_draw_numbers(image.image, places, p), folder / f"{Path(name).stem}_robots{PICTURE[0]}")
+    enlarged = f", {factor} times as large," if factor > 1 else ""
     raise UsageError(
-        f"{name}: {what.format(count, image.index)}; {picture} shows them with numbers: say which one is the "
-        "robot with --robot N, or by its place: --robot X,Ypx in the first image, --robot X,Y in um on the chip"
+        f"{name}: {what.format(count, image.index)}; {picture} shows them{enlarged} with numbers from the top down: say "
+        "which one is the robot with --robot N, or by its place: --robot X,Ypx in pixels of the movie, --robot X,Y in um"
     )
+
+
+def _factor(image: Image) -> int:
+    """Size of the drawn picture of the bodies over that of the image."""
+    return max(1, round(_SIDE_PX / max(image.shape)))
 
 
 def _candidates(p: Pipeline, frame: Frame, sight: Sight) -> tuple[Floats, str]:
@@ -278,7 +296,7 @@ def _draw_numbers(image: Image, places_px: Floats, p: Pipeline) -> NDArray[np.ui
     """The image (h, w, 3) with a circle and a number at each place."""
     low, high = (float(np.quantile(image, share)) for share in (0.001, 0.999))
     grey = np.clip((image.astype(np.float32) - low) * (255.0 / max(high - low, 1.0)), 0.0, 255.0).astype(np.uint8)
-    factor = max(1, round(_SIDE_PX / max(image.shape)))
+    factor = _factor(image)
     shown = cv2.cvtColor(
         cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR
     )

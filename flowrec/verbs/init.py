@@ -128,7 +128,7 @@ def init(
     """
     from flowrec.core import PICTURE, TOML, Output, UsageError, settings_of
     from flowrec.measure import calibrate_chip, open_field
-    from flowrec.stages import commented_toml, load_config
+    from flowrec.stages import commented_toml, load_config, refuse_unseen
 
     output = Output(out, TOML, (source,), overwrite)
     output.check()
@@ -138,7 +138,8 @@ def init(
     if own_chip and no_chip:
         raise UsageError("--no-chip: chip.path names a chip; leave one of them out")
     of_mask = PICTURE if no_chip else TOML
-    chip = Output(out.with_name(f"{source.stem}_chip{of_mask[0]}"), of_mask, (), overwrite)
+    stem = source.stem if out.name == OF_FOLDER.name else out.stem
+    chip = Output(out.with_name(f"{stem}_chip{of_mask[0]}"), of_mask, (), overwrite)
     if not own_chip:
         chip.check()
     lab = source == LAB and not source.exists()
@@ -154,6 +155,8 @@ def init(
     if no_chip:
         settled |= {"chip.um_per_px": settled["camera.um_per_px"], "chip.inlet_speed_um_s": 0.0}  # nothing else knows
     config = load_config(None, settled, _FLAGS)
+    width_px, height_px = subject.size_px
+    refuse_unseen(replace(config, rig=LAB, camera=replace(config.camera, width_px=width_px, height_px=height_px)))
     if lab and not config.mission.observes:
         _try_amplifier(config)
     if no_chip:

@@ -110,13 +110,13 @@ class Recorded:
             )
         elif covered is not None and covered.stopped:
             say(f"flowrec: {covered.text}; the session holds those, and no more is known of the movie")
-        elif report.outcome not in GOOD_ENDS and sessions:
-            say(f"flowrec: the mission ended {report.outcome}: {report.note}; see flowrec view {sessions[-1]}")
         for doubt in self.doubts:
             warn(f"doubtful: {doubt}")
         if sessions:
-            first = f"export {sessions[0]} tables" if "not_refined" in self.facts else f"replay {sessions[0]} --refine"
-            say(f"next: flowrec {first}    flowrec view {sessions[0]}")
+            refined = self.facts.get("refined_method") not in (None, "fvm") and "not_refined" not in self.facts
+            first = f"replay {sessions[0]} --refine" if refined else f"export {sessions[0]} tables --format csv"
+            verbs = [first, f"view {sessions[0]}"] if report.outcome in GOOD_ENDS else [f"view {sessions[0]}"]
+            say(f"next: {'    '.join(f'flowrec {each}' for each in verbs)}")
 
 
 def judges_of(pipeline: Pipeline) -> tuple[TrackQuality, MotionOfRun]:

@@ -77,7 +77,12 @@ def test_two_bodies_alike_are_refused_with_a_picture_and_each_way_to_name_one_ta
         assert run([*words, "--robot", which]) == 0
         assert np.hypot(*(first_place_px(tmp_path / "a.mcap") - PAIR[0][place])) < 1.0
     capsys.readouterr()
-    for which, said in (("3", "there are 2"), ("a,b", "neither a number"), ("900,90px", "outside of the image")):
+    for which, said in (
+        ("3", "there are 2"),
+        ("a,b", "neither a number"),
+        ("900,90px", "outside of the image"),
+        ("90,20px", "nothing differs from the background"),
+    ):
         assert run([*words, "--robot", which]) == 2
         assert said in capsys.readouterr().err
 

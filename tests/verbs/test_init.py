@@ -104,6 +104,15 @@ def test_a_movie_without_a_channel_is_tracked(tmp_path: Path) -> None:
         init(folder, no_chip=True, sets={"chip.path": "mine.png"}, out=tmp_path / "b.toml")
 
 
+@pytest.mark.parametrize(
+    ("um_per_px", "why"), [(2.85, r"0\.18 px .* camera\.um_per_px is 0\.3509"), (1e-3, "larger than the")]
+)
+def test_a_scale_at_which_no_image_can_show_the_robot_is_refused(tmp_path: Path, um_per_px: float, why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        init(MOVIE, **{**KNOWN, "um_per_px": um_per_px, "radius_um": 0.5}, no_chip=True, out=tmp_path / "flowrec.toml")
+    assert not [*tmp_path.iterdir()]
+
+
 def test_what_is_wrong_is_named_by_its_option_and_leaves_no_file(tmp_path: Path) -> None:
     out = tmp_path / "flowrec.toml"
     with pytest.raises(UsageError, match=r"^--radius: robot\.radius_um = -5"):

@@ -9,7 +9,6 @@ opening is a wall.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
 from collections.abc import Iterable
@@ -92,8 +91,7 @@ def name_inlets(openings: tuple[Opening, ...], inlets: Iterable[str], where: str
     for wanted in inlets:
         fitting = {name for name in names if wanted in (name, name.split(":")[0])}
         if not fitting:
-            near = difflib.get_close_matches(wanted, names, 1, 0.0)[0]
-            raise ChipError(f"{where}: no opening {wanted!r}; it has {', '.join(names)}. Did you mean {near!r}?")
+            raise ChipError(f"{where}: no opening {wanted!r}; it has {', '.join(names)}")
         chosen |= fitting
     kinds: list[Kind] = ["inlet" if name in chosen else "outlet" for name in names]
     return tuple(
