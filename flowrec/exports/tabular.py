@@ -95,7 +95,7 @@ class ParquetExport(_Tables):
     """Parquet, compressed; https://parquet.apache.org. Arrays are nested lists."""
 
     suffix = ".parquet"
-    advice = "a table a topic, for pandas.read_parquet, DuckDB and others, and datapackage.json with their units, are in"
+    advice = "a table a topic, which datapackage.json explains, for pandas.read_parquet, DuckDB and others, is in"
 
     def open_writer(self, path: Path, schema: pa.Schema) -> Any:
         return pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", compression_level=_LEVEL)
@@ -115,7 +115,7 @@ class CsvExport(_Tables):
         " A text that begins with = + - @, a tab, a return or an apostrophe has one more apostrophe before it, so that "
         "no spreadsheet runs it."
     )
-    advice = "a table a topic, for spreadsheets and everything else, and datapackage.json with their units, are in"
+    advice = "a table a topic, which datapackage.json explains, for spreadsheets and everything else, is in"
 
     def open_writer(self, path: Path, schema: pa.Schema) -> Any:
         return pyarrow.csv.CSVWriter(path, pa.schema([_text(field) for field in schema]))

@@ -123,8 +123,8 @@ def refuse_unseen(config: Config) -> None:
     if not _LEAST_RADIUS_PX <= radius_px <= most_px:
         why = "an image can not show it" if radius_px < 1.0 else "it is larger than the image"
         raise UsageError(
-            f"robot.radius_um = {radius_um:g} is {radius_px:.2g} px at camera.um_per_px = {um_per_px:g}: {why}; correct "
-            f"one of them (if a um is {um_per_px:g} px, camera.um_per_px is {1.0 / um_per_px:.4g})"
+            f"robot.radius_um = {radius_um:g} is {radius_px:.2g} px at camera.um_per_px = {um_per_px:g}: {why}; "
+            f"correct one of them (if a um is {um_per_px:g} px, camera.um_per_px is {1.0 / um_per_px:.4g})"
         )
 
 

@@ -266,8 +266,9 @@ def _with_chosen_body(asked: Config, p: Pipeline, image: Frame, sight: Sight, ro
     picture = write_picture(_draw_numbers(image.image, places, p), folder / f"{Path(name).stem}_robots{PICTURE[0]}")
     enlarged = f", {factor} times as large," if factor > 1 else ""
     raise UsageError(
-        f"{name}: {what.format(count, image.index)}; {picture} shows them{enlarged} with numbers from the top down: say "
-        "which one is the robot with --robot N, or by its place: --robot X,Ypx in pixels of the movie, --robot X,Y in um"
+        f"{name}: {what.format(count, image.index)}; {picture} shows them{enlarged} with numbers from the top down: "
+        "say which one is the robot with --robot N, or by its place: --robot X,Ypx in pixels of the movie, --robot "
+        "X,Y in um"
     )
 
 
