@@ -1,4 +1,4 @@
-from .export import export as export, kept_rrd as kept_rrd
+from .export import export as export, format_of as format_of, kept_rrd as kept_rrd
 from .formats import EXPORTS as EXPORTS
 from .layout import write_layouts as write_layouts
 from .report import style as style

@@ -33,7 +33,7 @@ def export(
     session: Session | Path | str,
     out: Path | str | None = None,
     overwrite: bool = False,
-    file_format: str = "rrd",
+    file_format: str | None = None,
     beside: Session | Path | str | None = None,
 ) -> Path:
     """Write a session in another format; return the file or folder.
@@ -44,7 +44,8 @@ def export(
         written into an existing folder, under the session's name. An earlier export of the same session is replaced if
         nothing in it was changed since, by its hash; a file only under the default name. Anything else is refused.
     overwrite : any existing file, and any folder that an export made, may be replaced, but nothing that is read.
-    file_format : name of a row of EXPORTS. In rrd a replay is shown beside its parent, if that is in the same folder.
+    file_format : name of a row of EXPORTS; by default that of the ending of `out`, else rrd. In rrd a replay is shown
+        beside its parent, if that is in the same folder.
     beside : of rrd: another session of the same chip and camera, shown on the same timeline and scale.
 
     Raises
@@ -52,6 +53,7 @@ def export(
     UsageError : there is no such format, or what it needs is not installed.
     SessionError : the session can not be read, or the output not be written; OutputError if it may not be.
     """
+    file_format = file_format or format_of(out)
     exporter: Exporter = EXPORTS[file_format].load()()
     sessions = session, *others = _open_all(session, beside)
     facts = {"format": file_format, "session": session.path.name, "session_key": session.key}
@@ -83,6 +85,20 @@ def export(
     took_s, amount = time.perf_counter() - began_s, Coverage(length_s, length_s, "s").amount
     say(f"{target} written in {took_s:.1f} s, {amount} of the session; {exporter.advice} {target}")
     return target
+
+
+def format_of(out: Path | str | None) -> str:
+    """The format that the ending of an output names; rrd of a folder, and without an output.
+
+    Raises UsageError where it names none.
+    """
+    if out is None or Path(out).is_dir():
+        return "rrd"
+    ending = Path(out).suffix.removeprefix(".").lower()
+    ending = "tiff" if ending == "tif" else ending
+    if ending not in EXPORTS.names():
+        raise UsageError(f"{out}: its ending names no format; say which with --format: {', '.join(EXPORTS.names())}")
+    return ending
 
 
 def kept_rrd(

@@ -20,7 +20,10 @@ def _export_told(asked: Asked, made: Path) -> Told:
     from flowrec.core import looked_at
 
     covered = {"covered": looked_at()[-1].as_json()}
-    return Told(lambda: export_json(asked["session"], made, asked["file_format"]) | covered)
+    from flowrec.exports import format_of
+
+    file_format = asked["file_format"] or format_of(asked["out"] or asked["directory"])
+    return Told(lambda: export_json(asked["session"], made, file_format) | covered)
 
 
 @verb("flowrec export a.mcap", "flowrec export a.mcap tables --format parquet", result=_export_told)
@@ -36,10 +39,10 @@ def export(
     ] = None,
     overwrite: Overwrite = False,
     file_format: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="Format of the output."),
+        str | None,
+        typer.Option("--format", metavar="FORMAT", help="Format of the output; else by the ending of OUT, or rrd."),
         MethodsOf("flowrec.exports.formats:EXPORTS"),
-    ] = "rrd",
+    ] = None,
     beside: AnySession | None = None,
     directory: Annotated[
         Path | str | None, typer.Argument(metavar="[OUT]", help="File or folder to write, or a folder for the file.")

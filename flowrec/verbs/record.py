@@ -153,9 +153,12 @@ def record(
     if short and not dry_run:
         raise MisuseError("prints a part of what --dry-run prints; give both", "--short")
     if dry_run:
+        from flowrec.core import MCAP, Output
         from flowrec.verbs.doctor import look_at_lab
         from flowrec.verbs.preparation import prepare
 
+        if path is not None:
+            Output(path, MCAP, inputs, overwrite).check()
         resolved = prepare(chosen).config
         file = inputs[0] if inputs else None
         return DryRun(

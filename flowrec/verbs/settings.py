@@ -47,8 +47,8 @@ def settings(
     about: Annotated[
         str | None,
         typer.Argument(
-            metavar="[SECTION|KEY]",
-            help="Explain this setting, or all of a section.",
+            metavar="[SECTION|KEY|WORD]",
+            help="Explain this setting, all of a section, or those that have a word in name or text.",
             autocompletion=complete_section,
         ),
     ] = None,
@@ -72,10 +72,21 @@ def settings(
         return SettingSections(
             {name: section_summary(kind) for name, kind in kinds.items()} | {single: "of the whole run"}
         )
-    found = [row for row in rows if row.key == about or row.key.startswith(f"{about}.")]
+    found = [row for row in rows if row.key == about or row.key.startswith(f"{about}.")] or _with_words(about, rows)
     if not found:
         keys = [row.key for row in rows]
         sections = {key[:end] for key in keys for end in (key.rfind("."), key.find(".")) if end > 0}
-        near = nearest_settings(about, [*keys, *sorted(sections)]) or ["plan", "mission"]
-        raise UsageError(f"{about}: no such setting; did you mean {' or '.join(near)}? flowrec settings lists all")
+        near = " or ".join(nearest_settings(about, [*keys, *sorted(sections)]))
+        hint = f"did you mean {near}? flowrec settings lists all" if near else "try another word, or flowrec settings"
+        raise UsageError(f"{about}: no such setting, and none with these words; {hint}")
     return ExplainedSettings(found)
+
+
+def _with_words(about: str, rows: list["SettingRow"]) -> list["SettingRow"]:
+    """Settings with all these words in their names, then those with them in their meaning."""
+    words = about.lower().replace("_", " ").split()
+    named, told = (
+        [row for row in rows if all(word in text(row).lower().replace("_", " ") for word in words)]
+        for text in (lambda row: row.key, lambda row: row.meaning)
+    )
+    return named + [row for row in told if row not in named]

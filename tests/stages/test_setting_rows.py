@@ -67,9 +67,17 @@ def test_only_what_differs_from_the_defaults_is_printed_in_short() -> None:
     assert [line for line in text.splitlines() if not line.startswith("#")] == ["[plan]", 'method = "astar_paper"']
 
 
+def test_a_word_finds_the_settings_that_have_it_in_their_name_or_their_meaning() -> None:
+    assert {"survey.speed_share", "plan.speed_share"} <= {row.key for row in settings("speed_share")}
+    assert "chip.viscosity_mpa_s" in [row.key for row in settings("viscosity")]
+    assert [row.key for row in settings("images per second")] == ["camera.rate_hz", "movie.rate_hz"]
+    with pytest.raises(UsageError, match=r"no such setting, and none with these words; "):
+        settings("xyzzy")
+
+
 def test_a_misspelt_setting_is_answered_with_the_nearest() -> None:
     with pytest.raises(UsageError, match=r"did you mean .*plan\.speed_share"):
-        settings("speed_share")
+        settings("sped_share")
     with pytest.raises(UsageError, match="did you mean mission"):
         settings("mision")
     # One of another section and a misspelt one: the same answer wherever it is given.

@@ -94,6 +94,8 @@ def check_point(chip: Chip, point_um: ArrayLike, what: str, clearance: float = 0
         problem = f"is outside the chip, which is {chip.size_um[0]:g} x {chip.size_um[1]:g} um"
     elif not chip.mask[row, column]:
         problem = "is in a wall"
+        if max(abs(x), abs(y)) < 10.0:
+            problem += " (it is read in um, not in mm)"
     elif clearance_um(chip.mask, chip.um_per_px)[row, column] < clearance:
         problem = f"is nearer to a wall than {clearance:g} um"
     else:

@@ -64,6 +64,8 @@ from flowrec.physics.chip.synthetic import bifurcation, straight, vessels
 from flowrec.physics.chip.vessel_case import read_vessel_case
 
 MAX_PIXELS = 3_600_000  # the flow field of a larger mask exceeds the largest chunk that a session may have
+# A mask is black and white, but for the blurred edges of its channels.
+_BLACK, _WHITE, _MOST_BETWEEN, _MOST_LEVELS = 32, 223, 0.25, 32
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 BUILT_IN: Mapping[str, Callable[[ChipSettings], Chip]] = {
     "bifurcation": lambda _: bifurcation(),
@@ -228,6 +230,12 @@ def _mask(png_bytes: bytes, fluid: str, where: str) -> Bools:
             grey = None
     if grey is None:
         raise ChipError(f"{where}: the mask is no PNG image, or a damaged one; save it again as 8-bit grey")
+    between = float(((grey > _BLACK) & (grey < _WHITE)).mean())
+    if between > _MOST_BETWEEN and len(np.unique(grey)) > _MOST_LEVELS:
+        raise ChipError(
+            f"{where}: a photograph, not a mask: {100 * between:.0f} % of its pixels are neither black nor white; "
+            f"flowrec calibrate chip {where} --um-per-px UM -o chip.toml makes the mask of it"
+        )
     mask = np.asarray(grey) >= 128
     if fluid == "dark":
         mask = ~mask

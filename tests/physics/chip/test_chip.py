@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import label
@@ -71,6 +72,20 @@ def test_grazed_pixels_are_no_openings_and_a_corner_is_only_one():
     found = [(o.side, o.first, o.last) for o in find_openings(mask)]
     # Column 59 rows 0-4 and row 0 columns 50-59 are one hole around the corner: the wider run stands for it.
     assert found == [("left", 10, 21), ("right", 10, 19), ("top", 50, 59)]
+
+
+def test_a_photograph_is_no_mask_and_a_mask_with_blurred_edges_is_one(tmp_path):
+    rng = np.random.default_rng(5)
+    photograph = (140.0 + 30.0 * rng.standard_normal((60, 80))).clip(0, 255).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), photograph)
+    with pytest.raises(
+        ChipError, match=r"photo\.png: a photograph, not a mask: .* flowrec calibrate chip .*photo\.png"
+    ):
+        load_chip(ChipSettings(path=str(tmp_path / "photo.png"), um_per_px=5.0))
+    sharp = np.where(mask_of(60, 80, np.s_[20:40, :]), 255, 0).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "mask.png"), cv2.GaussianBlur(sharp, (0, 0), 1.5))
+    chip = load_chip(ChipSettings(path=str(tmp_path / "mask.png"), um_per_px=5.0))
+    assert np.array_equal(chip.mask, sharp > 0)
 
 
 def test_settings_say_which_openings_are_inlets_and_how_fast(tmp_path):
