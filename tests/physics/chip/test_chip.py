@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import label
