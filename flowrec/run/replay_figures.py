@@ -131,7 +131,7 @@ def before_after(done: ReplayPair) -> list[Row]:
         add("stated_flow_error", lambda tick: tick.field.error_share if tick.field is not None else None)
     observations = now.observations or was.observations or no_observations(0)
     if len(observations.position_um) and was.field is not None and now.field is not None:
-        add("observations", lambda _: len(observations.position_um))
+        add("observations", lambda tick: 0 if tick.observations is None else len(tick.observations.position_um))
         add("residual_um_s", lambda tick: _residual_um_s(tick.field, observations))
     if was.route is not None or now.route is not None:
         add("planner", lambda tick: _planner(tick.route))

@@ -64,7 +64,10 @@ def replay(
     ] = None,
     sets: Sets = None,
     refly: Annotated[
-        bool, typer.Option("--refly", help="Fly both plans in a simulator with the refined flow.")
+        bool,
+        typer.Option(
+            "--refly", help="Fly both plans in a simulator, in the true flow if it is known, else the replay's map."
+        ),
     ] = False,
     jobs: Annotated[int, typer.Option(metavar="N", help="Processes of --verify; 0: one a core.")] = 1,
     view: Annotated[Literal["rrd", "none"], typer.Option(help="Write an .rrd of both, side by side.")] = "none",

@@ -88,7 +88,7 @@ def _with_numbers(path: Path) -> Path:
 
 
 def refly(done: Replay, out: Output | None) -> list[Row]:
-    """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
+    """Fly the recorded and the replayed plan in a simulator, in the true flow of the session or else the replay's map.
 
     Both flights begin where the recorded route does and have the same seed; rows as of `before_after`. They go straight
     to the last goal and keep the last speed limit that the operator has set.
@@ -108,6 +108,8 @@ def refly(done: Replay, out: Output | None) -> list[Row]:
     other_packages(done.session.config, done.session.provenance)  # it flies with the recorded stages, too
     x_um, y_um = (float(value) for value in planned_from(done.recorded, done.replayed))
     start_um = (x_um, y_um)
+    flow = "the map of the replay" if done.recorded.true_field is None else "the true flow of the session"
+    say(f"reflying both plans in {flow}")
     with progress("reflying", 2, "flights") as flights:
         was = _fly_plan(done, "recorded", start_um, None)
         flights(1)
@@ -136,7 +138,7 @@ def _fly_plan(done: Replay, name: str, start_um: tuple[float, float], out: Outpu
     )
     flown = replace(config, mission=mission)
     pipeline = assemble(flown, session.chip)
-    rig = SimulatedRig.of(pipeline, flown, true_field=done.replayed.field)
+    rig = SimulatedRig.of(pipeline, flown, true_field=done.recorded.true_field or done.replayed.field)
     known = {key: field for key in FLOW_FIELDS if (field := getattr(tick, key)) is not None}
     worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
     sinks: list[Sink] = []
@@ -146,7 +148,6 @@ def _fly_plan(done: Replay, name: str, start_um: tuple[float, float], out: Outpu
                 out, flown, session.chip, parent=session.path, facts=facts_of(flown, session.provenance)
             )
             sinks.append(stack.enter_context(writer))
-        say(f"reflying as {name} ...")
         control = RunControl()
         if last.speed_limit_um_s is not None:
             control.limit_speed(last.speed_limit_um_s)
