@@ -17,6 +17,7 @@ from flowrec.core import (
     ClockMonitor,
     Coverage,
     Figures,
+    FlowrecError,
     Outcome,
     Output,
     SessionError,
@@ -123,6 +124,7 @@ def run_mission(
     with ExitStack() as stack:
         # From the first byte of the file to the last, every way to end the run leaves a complete file.
         mission.connect(stack)
+        mission.refuse_stopped()
         mission.open_file(stack)
         watching = stack.enter_context(mission.watching(view, console))
         mission.fly(watching.sinks)
@@ -191,6 +193,8 @@ class _Mission:
             verdict = checked_image(rig.picture(), config, chip, "camera")
             self._source |= {"source_axes": verdict.text} if verdict is not None else {}
         tried = self._realtime and config.recording.admission_s > 0.0
+        if tried:
+            say("getting ready: methods, first flow, trial of the camera")
         if tried or not kernels_cached():
             rehearse_aloud(config, self._control)
         adopt_after_s, pipeline = config.worker.adopt_after_s, self._pipeline
@@ -200,6 +204,13 @@ class _Mission:
             scene = config, chip, pipeline
             self._source |= admit(rig, worker, scene, self._fields, self._folder, self.run_control)
         self._worker = Preloaded(worker, self._fields) if self._fields else worker
+
+    def refuse_stopped(self) -> None:
+        """Raise FlowrecError, with the status of a stop, where the run was stopped before it had a file."""
+        if self.run_control.reason:
+            error = FlowrecError(f"{self.run_control.reason}, before the mission began; nothing was recorded")
+            error.exit_status = self.run_control.with_stop(Coverage(0, 1, "ticks")).status
+            raise error
 
     def open_file(self, stack: ExitStack) -> None:
         """Open the file, and watch the disk that it is on."""

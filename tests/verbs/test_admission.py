@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError
+from flowrec.core.errors import FlowrecError, RigError
 from flowrec.core.topics import Tick
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.control import RunControl
@@ -22,6 +22,7 @@ from flowrec.stages.config import load_config
 from flowrec.stages.pipeline import Inputs
 from flowrec.verbs import admission
 from flowrec.verbs.admission import Held, admit
+from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.preparation import Prepared, prepare
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL
@@ -47,6 +48,14 @@ def test_images_that_the_machine_does_not_hold_are_refused_before_there_is_a_fil
     with pytest.raises(RigError, match=rf"holds \d+ of {HZ:g} images a second.*close other programs.*--accept-losses"):
         record(config, tmp_path / "never.mcap", realtime=True)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_is_stopped_before_it_begins_leaves_no_file_and_says_so(tmp_path: Path) -> None:
+    control = RunControl()
+    control.stop("stopped by SIGTERM")
+    with pytest.raises(FlowrecError, match="SIGTERM, before the mission began; nothing was recorded") as refused:
+        record(load_config(None, SMALL), tmp_path / "never.mcap", control=Unattended(control))
+    assert refused.value.exit_status in (130, 143) and not list(tmp_path.iterdir())
 
 
 def test_whoever_accepts_losses_goes_on_and_the_session_says_what_the_machine_held(
