@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit  # quantile of Student's t; scipy.stats takes 0.3 s to load
 
 from flowrec.core import Floats, UsageError, refuse_irregular
 from flowrec.stages import WORST_CONDITION, direction_name
@@ -181,7 +181,7 @@ def fit_coils(excitations: Excitations) -> CoilFit:
         others = np.maximum((residual**2).sum() - (residual**2 / free).sum(1), 0.0) / (3 * (freedom - 1))
         floor = (1e-12 * max(float(np.abs(field).max()), 1e-12)) ** 2
         score = residual / np.sqrt((others[:, None] + floor) * free)
-        critical_score = float(student.ppf(1.0 - 0.5 * _SIGNIFICANCE / residual.size, 3 * (freedom - 1)))
+        critical_score = float(stdtrit(3 * (freedom - 1), 1.0 - 0.5 * _SIGNIFICANCE / residual.size))
     A = solution[:3].T
     directions, gain, _ = np.linalg.svd(A)
     if gain[-1] * WORST_CONDITION <= gain[0]:

@@ -176,11 +176,11 @@ def _references(by_settings: dict[str, dict[str, Row]], figure: str, common: Seq
 
 def _paired_difference(values: Sequence[float], best: Sequence[float]) -> tuple[float, tuple[float, float] | None]:
     """Mean difference and its 95 % interval."""
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     differences = np.subtract(values, best)
     mean, count = float(differences.mean()), len(differences)
     if count < 2:
         return mean, None
-    half = float(t.ppf(0.975, count - 1) * differences.std(ddof=1) / math.sqrt(count))
+    half = float(stdtrit(count - 1, 0.975) * differences.std(ddof=1) / math.sqrt(count))
     return mean, (mean - half, mean + half)
