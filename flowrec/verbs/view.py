@@ -132,7 +132,7 @@ def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: 
     kept = None if overwrite else kept_rrd(opened, out, second)
     if kept is not None:
         return kept, [f"{kept} is as it was made of this session"]
-    return export(opened, out, overwrite, beside=second), []
+    return export(opened, out, overwrite, "rrd", second), []
 
 
 def _watch(session: Path | None, mode: Literal["spawn", "serve"], console: bool, outputs: Iterable[object]) -> Told:

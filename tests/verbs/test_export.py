@@ -43,6 +43,17 @@ def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def test_the_ending_of_an_output_names_its_format_and_one_that_names_none_is_asked_for(
+    brief: Path, tmp_path: Path
+) -> None:
+    assert flowrec.export(brief, tmp_path / "a.csv") == tmp_path / "a.csv"
+    assert (tmp_path / "a.csv" / "track.csv").exists()
+    assert flowrec.export(brief, tmp_path).suffix == ".rrd"  # a folder names none: what the view opens
+    for name in ("tables", "a.h5"):
+        with pytest.raises(UsageError, match=rf"{name}: its ending names no format; say which with --format: rrd, "):
+            flowrec.export(brief, tmp_path / name)
+
+
 def test_an_export_replaces_an_earlier_export_of_the_same_session_and_no_other_file(
     any_export: str, brief: Path, tmp_path: Path
 ) -> None:

@@ -34,7 +34,7 @@ VERBS: dict[str, tuple[Callable[[Path], list[object]], str, str]] = {
     "record, configuration": (lambda read: ["record", read, *BRIEF, "--out"], "conf.toml", ".mcap"),
     "record, flow field": (lambda read: ["record", "--set", f"start.field={read}", *BRIEF, "--out"], "a.mcap", ".mcap"),
     "replay": (lambda read: ["replay", read, "--out"], "a.mcap", ".mcap"),
-    "export": (lambda read: ["export", read, "--out"], "a.mcap", ".rrd"),
+    "export": (lambda read: ["export", read, "--format", "rrd", "--out"], "a.mcap", ".rrd"),
     "view": (lambda read: ["view", read, "--no-open", "--out"], "a.mcap", ".rrd"),
     "view, screenshot": (lambda read: ["view", read, "--screenshot"], "a.mcap", ".png"),
     "calibrate, coils": (lambda read: ["calibrate", "coils", read, "--out"], "coils.csv", ".toml"),
