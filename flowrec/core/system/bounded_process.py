@@ -65,8 +65,7 @@ class BoundedProcess:
             raise failure
         if failure:
             raise self._error(f"{self._where}: {self._words(failure)}")
-        result: Answer = answer
-        return result
+        return answer
 
     def begin(self, function: Callable[..., object], *given: Any) -> None:
         """Have a function called of which only an effect is wanted, such as a filled cache: nobody waits for it."""

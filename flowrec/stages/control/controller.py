@@ -190,8 +190,7 @@ class Controller:
 @lru_cache(maxsize=16)
 def _law(settings: Controller) -> TrackingLaw:
     """The method of a controller with the settings that its row names."""
-    law: TrackingLaw = CONTROLLERS[settings.method].build(settings)
-    return law
+    return CONTROLLERS[settings.method].build(settings)
 
 
 def _where_it_is(now: Situation) -> Reference:
