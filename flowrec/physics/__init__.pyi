@@ -29,7 +29,7 @@ from .chip.synthetic import (
     bifurcation as bifurcation, draw_channel as draw_channel, smooth_curve as smooth_curve, straight as straight,
     vessels as vessels,
 )
-from .chip.vessel_case import read_case as read_case, read_vessel_case as read_vessel_case
+from .chip.io import read_case as read_case, read_vessel_case as read_vessel_case
 from .flow.generalised import generalised_equations as generalised_equations
 from .flow.level_set import from_distance as from_distance
 from .flow.linear_solver import chip_key as chip_key, clear_cache as clear_cache, compute_cached as compute_cached
