@@ -21,7 +21,6 @@ from flowrec.core import (
     refuse_irregular,
 )
 from flowrec.store.audit import disagreements, edits_of
-from flowrec.store.byte_source import on_this_machine
 from flowrec.store.channels import SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
 from flowrec.store.mcap_reader import DamageError, McapReader
@@ -47,6 +46,7 @@ from flowrec.store.session_metadata import (
     SESSION,
     Part,
 )
+from flowrec.store.session_path import on_this_machine
 from flowrec.store.viewer_pass import draw
 from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.writer import SessionWriter
