@@ -53,8 +53,10 @@ def test_work_that_waits_for_a_disk_is_ended_by_the_clock():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a process ends by no signal there")
 def test_a_reader_that_crashes_takes_nobody_with_it():
-    with BoundedProcess("a.bin", 10.0) as process, pytest.raises(UsageError, match=r"its reader has ended \(SIGABRT"):
-        process.call(os.abort)
+    with BoundedProcess("a.bin", 10.0, by_clock=True) as process:
+        for work in (os.abort, os.getpid):  # the second one does not wait for a process that has ended
+            with pytest.raises(UsageError, match=r"its reader has ended \(SIGABRT"):
+                process.call(work)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a process ends by no signal there")
