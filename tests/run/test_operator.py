@@ -263,6 +263,7 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
 ) -> None:
     left = tmp_path / "left.mcap.partial"
     left.write_bytes(session.read_bytes()[: session.stat().st_size // 2])
+    left.with_name("left.recovering.mcap.partial").write_bytes(b"")  # of one that was ended a little later
     threads, files = set(threading.enumerate()), set(Path("/dev/fd").iterdir())
     monkeypatch.setattr("flowrec.verbs.auto_recovery._TIMEOUT_S", 0.05)
     assert recover_leftovers(tmp_path) == {}
