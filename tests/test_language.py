@@ -20,7 +20,7 @@ LONG = "Long because"  # begins the sentence that gives the reason
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 # Exceptions, with the rename or the work that will end them. A list only shrinks: an entry that is not needed fails.
-CAMERAS = ("camera", "genicam", "mmcore", "opencv", "pylon")
+CAMERAS = ("camera", "genicam", "mmcore", "pylon")
 PARTICIPLES = {
     **{f"rigs/lab/cameras/{name}.py: discarded": "cameras of other packages implement it" for name in CAMERAS},
     **{f"rigs/{name}.py: connected": "rigs of other packages implement it" for name in ("rig", "lab/rig")},

@@ -1,4 +1,4 @@
-"""Random vessel networks with a true and an assumed flow, in the format of a vessel case (`chip/vessel_case.py`).
+"""Random vessel networks with a true and an assumed flow, in the format of a vessel case (`chip/io.py`).
 
 The true flow is computed by flowrec's own solver, on a finer grid. The cases therefore measure a refinement, not the
 solver.

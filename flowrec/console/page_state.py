@@ -113,8 +113,7 @@ class PageState:
     def _pixels(self, points_um: Floats) -> list[list[float]]:
         to_image = self._scene.plane_to_image(self.tick)
         pixels = self._scene.to_plane(points_um) @ to_image[:, :2].T + to_image[:, 2]
-        found: list[list[float]] = np.round(pixels, 1).tolist()
-        return found
+        return np.round(pixels, 1).tolist()
 
 
 def _outlines(scene: Scene) -> list[Floats]:

@@ -67,7 +67,7 @@ from .summary import (
 from .system.blas_threads import one_blas_thread as one_blas_thread
 from .system.bounded_process import BoundedProcess as BoundedProcess
 from .system.shared_ring import SharedRing as SharedRing
-from .system.child_process import ChildProcess as ChildProcess, Parent as Parent
+from .system.child_process import ChildEndedError as ChildEndedError, ChildProcess as ChildProcess, Parent as Parent
 from .system.durable import (
     append_line as append_line, put_in_place as put_in_place, replace_content as replace_content,
     replacing as replacing, sync_directory as sync_directory, write_all as write_all,
@@ -92,8 +92,7 @@ from .system.outputs import (
     named_otherwise as named_otherwise, note_written as note_written, written_sha256 as written_sha256,
 )
 from .system.processes import (
-    Priority as Priority, child_command as child_command, child_environment as child_environment,
-    forget_peak as forget_peak, peak_mb as peak_mb, pool as pool, prioritise_process as prioritise_process,
+    Priority as Priority, forget_peak as forget_peak, peak_mb as peak_mb, pool as pool, prioritise_process as prioritise_process,
     prioritise_thread as prioritise_thread, realtime_priority as realtime_priority,
     start_child as start_child,
 )

@@ -255,5 +255,4 @@ def nearest_of(name: object, names: Sequence[str]) -> str:
 
 def table_at(target: str) -> Methods:
     """The table at "module:name"."""
-    found: Methods = pkgutil.resolve_name(target)
-    return found
+    return pkgutil.resolve_name(target)

@@ -125,8 +125,7 @@ class CoilFit(NamedTuple):
     @property
     def worst(self) -> list[int]:
         """Row of the largest residual of each axis."""
-        rows: list[int] = np.abs(self.residual_mt).argmax(axis=0).tolist()
-        return rows
+        return np.abs(self.residual_mt).argmax(axis=0).tolist()
 
     @property
     def suspects(self) -> list[int]:

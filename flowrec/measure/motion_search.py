@@ -158,8 +158,8 @@ def _rates(motion: _Motion, within: SearchRange) -> list[float]:
     step = max(_RATE_STEP / max(len(motion.motion) / 2, 1), (high - low) / _MOST_RATES)
     if low <= 0.0 <= high:
         counts = np.arange(math.ceil(low / step), math.floor(high / step) + 1)
-        return np.exp(step * counts).tolist()  # type: ignore[no-any-return]
-    return np.exp(np.arange(low, high, step)).tolist()  # type: ignore[no-any-return]
+        return np.exp(step * counts).tolist()
+    return np.exp(np.arange(low, high, step)).tolist()
 
 
 def _apart(one: Candidate, other: Candidate, motion: _Motion) -> bool:

@@ -302,8 +302,7 @@ def _alike(profiles: Floats, mean: Floats, seen: Mask) -> Mask:
     levelled = profiles - profiles.mean(-1, keepdims=True)
     size, own, product = np.sqrt(np.sum(f * f)), np.sqrt(np.sum(levelled**2, -1)), levelled @ f
     faint = _FAINT * float(np.median(product[seen]))
-    alike: Mask = (product > _LIKE * np.maximum(own * size, 1e-12)) & (product > faint)
-    return alike
+    return (product > _LIKE * np.maximum(own * size, 1e-12)) & (product > faint)
 
 
 def _wall_in(mean: Floats, walls: Walls) -> tuple[float, float, float, float]:

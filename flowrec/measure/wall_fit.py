@@ -302,8 +302,7 @@ class _Model:
     def _of_motion(self) -> Floats:
         """(n,) derivative of b f(d) by d."""
         slope = np.gradient(self._profile) * _KNOTS / self._reach_um
-        of_d: Floats = self.gain[self._patch] * self._at(slope)
-        return of_d
+        return self.gain[self._patch] * self._at(slope)
 
     def _jacobian(self) -> tuple[Floats, Floats]:
         """(n, 4) derivatives of b f(d) by the motion, without what other f, a and b could explain; normal matrix."""

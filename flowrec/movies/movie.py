@@ -173,8 +173,7 @@ class Movie(ABC):
         facts = self.facts
         affordable = _MEDIAN_BYTES // (facts.width_px * facts.height_px * pixel_type(facts.bits).itemsize)
         count = max(min(count, facts.frames, affordable), 1)
-        indices: list[int] = np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int)).tolist()
-        return indices
+        return np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int)).tolist()
 
     def __enter__(self) -> Self:
         return self
@@ -213,8 +212,7 @@ class Movie(ABC):
 def median_of(images: Iterable[Image]) -> Image:
     """Median of images of one size."""
     stack = np.stack(list(images))
-    median: Image = np.median(stack, axis=0, overwrite_input=True).round().astype(stack.dtype)
-    return median
+    return np.median(stack, axis=0, overwrite_input=True).round().astype(stack.dtype)
 
 
 def checked_size(path: Path, width_px: int, height_px: int) -> tuple[int, int]:

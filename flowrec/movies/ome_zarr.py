@@ -91,8 +91,7 @@ class ZarrMovie(Movie):
             with refusing(f"{self.path}: image {index} can not be read"):
                 block = np.asarray(array[tuple(place)])
             self._held = first, block if along is not None else block[None]
-        plane: NDArray[Any] = self._held[1][index - first]
-        return plane
+        return self._held[1][index - first]
 
 
 class _FinestLevel(NamedTuple):

@@ -68,8 +68,7 @@ class BoundedMovie(Movie):
 
 
 def _load(path: Path, reader: str, options: ReadOptions) -> Movie:
-    movie: Movie = MOVIE_READERS[reader].load()(path, options)
-    return movie
+    return MOVIE_READERS[reader].load()(path, options)
 
 
 def _open_in_child(path: Path, reader: str, options: ReadOptions) -> tuple[MovieFacts, list[str]]:

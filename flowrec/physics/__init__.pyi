@@ -12,7 +12,8 @@ from .chip.fluid import (
 )
 from .chip.io import (
     CHIP_KEYS as CHIP_KEYS, MAX_PIXELS as MAX_PIXELS, chip_files as chip_files, chip_from_files as chip_from_files,
-    load_chip as load_chip, without_pockets as without_pockets,
+    load_chip as load_chip, read_case as read_case, read_vessel_case as read_vessel_case,
+    without_pockets as without_pockets,
 )
 from .chip.openings import (
     border as border, check_chip as check_chip, distance_px as distance_px, distance_um as distance_um,
@@ -20,16 +21,14 @@ from .chip.openings import (
     named_opening as named_opening, opening_names as opening_names, run_around as run_around,
     set_inlet_speed as set_inlet_speed,
 )
-from .chip.orientation import (
-    AS_STATED as AS_STATED, ORIENTATIONS as ORIENTATIONS, Orientation as Orientation,
-    camera_settings as camera_settings, likeness as likeness, nearest as nearest,
+from .chip.registration import (
+    AS_STATED as AS_STATED, Calibration as Calibration, ORIENTATIONS as ORIENTATIONS, Orientation as Orientation,
+    camera_settings as camera_settings, likeness as likeness, nearest as nearest, on_chip as on_chip,
 )
-from .chip.registration import Calibration as Calibration, on_chip as on_chip
 from .chip.synthetic import (
     bifurcation as bifurcation, draw_channel as draw_channel, smooth_curve as smooth_curve, straight as straight,
     vessels as vessels,
 )
-from .chip.vessel_case import read_case as read_case, read_vessel_case as read_vessel_case
 from .flow.generalised import generalised_equations as generalised_equations
 from .flow.level_set import from_distance as from_distance
 from .flow.linear_solver import chip_key as chip_key, clear_cache as clear_cache, compute_cached as compute_cached

@@ -19,8 +19,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import WORKER_FIELDS, ChildProcess, FlowrecError, Parent, Tick
-from flowrec.run.workers import Result, Results, order_of, work
+from flowrec.core import WORKER_FIELDS, ChildEndedError, ChildProcess, FlowrecError, Parent, Tick
+from flowrec.run.workers import Results, order_of, work
 from flowrec.stages import Pipeline, warm_up
 
 _NAME = "the process that solves and plans"
@@ -35,8 +35,7 @@ class ProcessWorker:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._fills: deque[str] = deque()  # fields of Tick that the results to come go to
-        # The threads share only these queues, which lock themselves.
-        self._results: queue.SimpleQueue[Result | Exception] = queue.SimpleQueue()
+        self._unsent: FlowrecError | None = None  # why an order was never sent
         self._orders: queue.SimpleQueue[Pipeline | Tick | None] = queue.SimpleQueue()
         self._orders.put(pipeline)
         try:
@@ -45,11 +44,8 @@ class ProcessWorker:
             raise FlowrecError(
                 f"{_NAME} does not start ({error.strerror or error}); free memory, then record again"
             ) from error
-        self._threads = [
-            threading.Thread(target=target, name="work process", daemon=True) for target in (self._send, self._receive)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._sender = threading.Thread(target=self._send, name="work process", daemon=True)
+        self._sender.start()
 
     def submit(self, order: Tick) -> None:
         """Start on an order as soon as those before it are done."""
@@ -66,8 +62,10 @@ class ProcessWorker:
         """
         if not self._fills:
             return {}
+        if self._unsent is not None:
+            raise self._unsent
         try:
-            result = self._results.get_nowait()
+            result = self._child.receive(0.0)
         except queue.Empty:
             if self._is_stopped():
                 raise FlowrecError(
@@ -75,6 +73,12 @@ class ProcessWorker:
                     "it; find out who sent it, then record again"
                 ) from None
             return {}
+        except ChildEndedError as error:
+            raise FlowrecError(f"{_NAME} has ended unasked ({error.how}); {self._log()}") from error
+        except Exception as error:
+            raise FlowrecError(
+                f"{_NAME} gave an answer that can not be read ({_describe(error)}); {self._log()}"
+            ) from error
         if isinstance(result, Exception):
             raise result
         return {self._fills.popleft(): replace(result, stamp_ns=stamp_ns)}
@@ -83,13 +87,12 @@ class ProcessWorker:
         """End the process at once, its threads and pipes."""
         self._child.process.kill()
         self._orders.put(None)
-        for thread in self._threads:
-            thread.join(_JOIN_S)
+        self._sender.join(_JOIN_S)
         self._child.close()
 
     def _is_stopped(self) -> bool:
         if sys.platform != "win32":  # where no signal stops a process
-            with contextlib.suppress(ChildProcessError):  # it has ended; the receiver reports that
+            with contextlib.suppress(ChildProcessError):  # it has ended, which the next call tells
                 return os.waitid(os.P_PID, self._child.process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
         return False
 
@@ -97,21 +100,8 @@ class ProcessWorker:
         try:
             while (order := self._orders.get()) is not None:
                 self._child.send(order)
-        except OSError:
-            pass  # it has ended; the receiver reports that
         except Exception as error:  # noqa: BLE001  the mission must not wait for an order that was never sent
-            self._results.put(FlowrecError(f"{_NAME} can not be sent an order ({_describe(error)})"))
-
-    def _receive(self) -> None:
-        try:
-            while True:
-                self._results.put(self._child.receive())
-        except (OSError, EOFError, pickle.UnpicklingError):
-            self._results.put(FlowrecError(f"{_NAME} has ended unasked ({self._child.cause()}); {self._log()}"))
-        except BaseException as error:  # noqa: BLE001  after any error the mission must not wait for ever
-            self._results.put(
-                FlowrecError(f"{_NAME} gave an answer that can not be read ({_describe(error)}); {self._log()}")
-            )
+            self._unsent = FlowrecError(f"{_NAME} can not be sent an order ({_describe(error)})")
 
     def _log(self) -> str:
         """Write the log file; the end of an error text that names it."""

@@ -4,7 +4,6 @@ from .bucket_upload import (
 )
 from .byte_source import is_there as is_there, open_bytes as open_bytes, size_of as size_of
 from .channels import FRAME_PATH as FRAME_PATH, SLOTS as SLOTS, is_left_out as is_left_out
-from .cut import cut_session as cut_session
 from .growing_run import GrowingRun as GrowingRun, live_runs as live_runs
 from .mcap_reader import ForeignError as ForeignError
 from .notes import NOTES_SUFFIX as NOTES_SUFFIX, Note as Note, notes_content as notes_content, notes_file as notes_file
@@ -34,7 +33,7 @@ from .session_path import (
     session_path as session_path,
 )
 from .session_writer import (
-    frames_of as frames_of, image_bytes_s as image_bytes_s, session_header as session_header,
+    cut_session as cut_session, frames_of as frames_of, image_bytes_s as image_bytes_s, session_header as session_header,
     session_writer as session_writer,
 )
 from .signature import (

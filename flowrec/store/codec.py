@@ -152,8 +152,7 @@ def timestamp(stamp_ns: int) -> dict[str, int]:
 
 def stamp_of(parsed: Any) -> int:
     """The stamp of a parsed message that has a `timestamp`, in ns."""
-    stamp: int = parsed.timestamp.seconds * NS_PER_S + parsed.timestamp.nanos
-    return stamp
+    return parsed.timestamp.seconds * NS_PER_S + parsed.timestamp.nanos
 
 
 def byte_field_head(number: int, nbytes: int) -> bytes:

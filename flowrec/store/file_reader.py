@@ -121,8 +121,7 @@ class FileReader(SessionContents):
         if len(records) != count:
             why = f"{count} images are announced, the chunk has {len(records)}"
             raise self.source.damage_error(chunks[place].chunk_start_offset, why)
-        frame: Frame = self._restore(records[number - firsts[place]])
-        return frame
+        return self._restore(records[number - firsts[place]])
 
     @functools.cached_property
     def _frame_numbers(self) -> tuple[list[int], list[ChunkIndex]] | None:

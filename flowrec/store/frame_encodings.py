@@ -93,8 +93,7 @@ def decode_image(data: bytes | memoryview, bits: int = 8) -> Image:
         raise ValueError("an image that can not be decoded") from error
     if image is None or image.shape != (height, width) or image.dtype != expected:
         raise ValueError("an image that is not of grey levels, or damaged")
-    decoded: Image = image.view(expected)
-    return decoded
+    return image.view(expected)
 
 
 def _stored_differences(data: memoryview, height: int, width: int, itemsize: int) -> NDArray[np.uint8] | None:

@@ -185,8 +185,7 @@ def parse_summary(data: bytes, data_end: int) -> Summary:
 @functools.lru_cache(_DECLARATIONS_KEPT)
 def _declaration(opcode: int, body: bytes) -> Schema | Channel:
     """A schema or channel; nobody changes it, and most sessions of a folder declare the same ones."""
-    found: Schema | Channel = (Schema if opcode == Opcode.SCHEMA else Channel).read(stream_of(body))
-    return found
+    return (Schema if opcode == Opcode.SCHEMA else Channel).read(stream_of(body))
 
 
 def lone_count(chunk: ChunkIndex) -> int | None:

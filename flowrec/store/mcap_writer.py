@@ -194,8 +194,7 @@ def _bytes_of(*records: McapRecord) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
-    return data
+    return builder.end()  # type: ignore[no-untyped-call]
 
 
 def _chunk_head(chunk: SealedChunk) -> bytes:

@@ -220,8 +220,7 @@ class SessionReader:
             if file.first_ns <= stamp_ns <= file.last_ns and "frame" in self._fields[number]:
                 found_ns, state = self.file(number).state_at(stamp_ns, {"frame"})
                 if found_ns == stamp_ns:
-                    frame: Frame = state["frame"]
-                    return frame
+                    return state["frame"]
         raise SessionError(f"{self.path}: has no image at {stamp_ns} ns")
 
     def close(self) -> None:

@@ -23,6 +23,7 @@ from typing import IO, Any
 import numpy as np
 
 from flowrec.core import (
+    ChildEndedError,
     ChildProcess,
     FlowField,
     Priority,
@@ -132,8 +133,8 @@ class RecorderProcess:
             assert self._child.process.stdin is not None
             self.queue.wake_by(self._child.process.stdin.fileno())
             refusal: str = self._child.receive()
-        except (OSError, EOFError, pickle.UnpicklingError) as error:
-            raise SessionError(f"{plan.path}: its recorder does not start ({self._cause()})") from error
+        except ChildEndedError as error:
+            raise SessionError(f"{plan.path}: its recorder does not start ({error})") from error
         if refusal:
             self._close()
             raise SessionError(refusal)
@@ -171,10 +172,10 @@ class RecorderProcess:
         try:
             while not self._ended.is_set():
                 self._take(self._child.receive())
-        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+        except ChildEndedError as error:
             if not self._ended.is_set():
                 self.failure = SessionError(
-                    f"{self.partial_path}: its recorder has ended ({self._cause()});"
+                    f"{self.partial_path}: its recorder has ended ({error});"
                     f" `flowrec recover {self.partial_path}` saves what it had written"
                 )
         finally:
@@ -189,10 +190,6 @@ class RecorderProcess:
             self.files, self.partial_path, self.dropped, failure = value
             self.failure = failure or self.failure
             self._ended.set()
-
-    def _cause(self) -> str:
-        last = self._child.last_line
-        return self._child.cause() + (f": {last[:300]}" if last else "")
 
     def _close(self) -> None:
         """The process ends by itself, when its pipe is closed."""

@@ -1,21 +1,66 @@
-"""Creates a session file: the header with configuration, chip and provenance, and the options of the writer."""
+"""Creates a session file: the header with configuration, chip and provenance, and the options of the writer.
+
+A stretch of a session becomes a session of its own, which replays exactly from its first tick: it is a snapshot that
+begins with a keyframe, the full state at the tick before. So a stage finds in it what it had remembered.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.core import Output, TopicTable, pixel_type, provenance, remove_leftovers_once
+from flowrec.core import Outcome, Output, TopicTable, pixel_type, provenance, remove_leftovers_once, seconds
 from flowrec.physics import Chip, chip_files
 from flowrec.stages import SIMULATED, ResolvedConfig, calibration_of, facts_of, to_toml, topics_of
-from flowrec.store.frame_encodings import encoding_for
+from flowrec.store.frame_encodings import ENCODINGS, encoding_for
+from flowrec.store.reader import SessionReader
 from flowrec.store.roi import Region
 from flowrec.store.run_files import files_behind, files_of, session_sha256
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.session_metadata import SessionHeader, SessionMetadata
+from flowrec.store.session_metadata import Part, SessionHeader, SessionMetadata
 from flowrec.store.writer import SessionWriter
+
+_LOSSLESS = "zstd"  # for images of a lossy encoding: once more through it they would be others
+
+
+def cut_session(reader: SessionReader, output: Output, from_ns: int, to_ns: int) -> int:
+    """Write the ticks from one stamp to another, both included, and return their number.
+
+    Raises
+    ------
+    SessionError : damage in the session, or the disk refuses; then there is no file.
+    """
+    config = reader.header.config().recording
+    name = config.frames if config.frames in ENCODINGS and ENCODINGS[config.frames].lossless else _LOSSLESS
+    before = reader.tick_before(from_ns - 1)
+    begins = from_ns <= reader.first_ns
+    why = f"{seconds(from_ns):g} s to {seconds(to_ns):g} s of {reader.path.name}"
+    part = Part(os.urandom(8).hex(), 1, "snapshot", None if begins else before.stamp_ns, why)
+    options = WriterOptions(
+        frames=name,
+        overwrite=output.overwrite,
+        block=True,
+        region=reader.region,
+        leave_out=config.leave_out,
+        bits=reader.frame_bits,
+        keep_failed=False,
+        topics=reader.topics,
+    )
+    with SessionWriter(output.path, replace(reader.header, part=part), options, inputs=output.inputs) as writer:
+        if not begins:
+            writer.write(before)
+        count = 0
+        for tick in reader.ticks(from_ns):
+            if tick.stamp_ns > to_ns:
+                break
+            writer.write(tick)
+            count += 1
+        writer.close({"outcome": Outcome.SNAPSHOT, "note": f"cut from {why}"})
+    return count
+
 
 _QUEUE_S = 4.0
 _LARGEST_PICTURE_BYTES = 50_000_000

@@ -255,8 +255,7 @@ def _content_of(record: memoryview, *, copied: bool) -> Entry | End:
     (length,) = _HEAD.unpack_from(record)
     at = _HEAD.size
     if not length:
-        end: End = pickle.loads(record[at:])  # noqa: S301 - from our own parent
-        return end
+        return pickle.loads(record[at:])  # noqa: S301 - from our own parent
     given, told = pickle.loads(record[at : at + length])  # noqa: S301 - from our own parent
     entry = Entry(*given)
     at += length

@@ -105,8 +105,7 @@ def thin_line(points_um: NDArray[np.float64], step_um: float) -> NDArray[np.floa
         return points_um
     keep = np.diff(np.floor(distance_um(points_um) / step_um), prepend=-1.0) != 0.0
     keep[-1] = True
-    kept: NDArray[np.float64] = points_um[keep]
-    return kept
+    return points_um[keep]
 
 
 def distance_um(points_um: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -182,15 +181,13 @@ def _pose(x_um: float, y_um: float) -> fg.Pose:
 @functools.lru_cache(maxsize=2)  # asked for twice
 def _pose_field(x_um: float, y_um: float) -> bytes:
     """A message with a pose alone."""
-    data: bytes = fg.PoseInFrame(pose=_pose(x_um, y_um)).encode()
-    return data
+    return fg.PoseInFrame(pose=_pose(x_um, y_um)).encode()
 
 
 @functools.lru_cache(maxsize=8)
 def _ring(radius_um: float, rgba: Rgba) -> bytes:
     """The points about the robot, without their pose."""
-    data: bytes = _cloud(_RING_RADII * radius_um * _circle_points(), rgba, placed=False).encode()
-    return data
+    return _cloud(_RING_RADII * radius_um * _circle_points(), rgba, placed=False).encode()
 
 
 def _circle_points() -> NDArray[np.float64]:

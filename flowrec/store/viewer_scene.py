@@ -65,8 +65,7 @@ class Picture:
     def _inverse(self) -> list[list[float]]:
         """(2, 3): pixel, from the corner of the first, of chip coordinates (x, y, 1) in um."""
         back = np.linalg.inv(self.matrix[:, :2])
-        found: list[list[float]] = np.column_stack((back, _HALF_PX - back @ self.matrix[:, 2])).tolist()
-        return found
+        return np.column_stack((back, _HALF_PX - back @ self.matrix[:, 2])).tolist()
 
     def to_px(self, points_um: NDArray[np.float64]) -> NDArray[np.float64]:
         """Chip points (n, 2) in um as pixels (n, 2), counted from the corner of the first."""
@@ -229,8 +228,7 @@ class ViewerScene:
 @functools.lru_cache(maxsize=4)  # several views are of the same moment
 def _stamp(unix_ns: int) -> bytes:
     # Not by foxglove's class, which refuses times out of range.
-    data: bytes = foxglove_schema("PoseInFrame").wire(timestamp=timestamp(unix_ns)).SerializeToString()
-    return data
+    return foxglove_schema("PoseInFrame").wire(timestamp=timestamp(unix_ns)).SerializeToString()
 
 
 def _map(field: FlowField) -> Picture | None:

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flowrec.core import PREFIX, FlowrecError, child_command, child_environment, is_growing, say, try_lock, warn
-from flowrec.store import PARTIAL_SUFFIX, SESSION_SUFFIX, recover
+from flowrec.core import PREFIX, BoundedProcess, FlowrecError, is_growing, remove_idle, say, try_lock, warn
+from flowrec.store import PARTIAL_SUFFIX, SESSION_SUFFIX, Recovered, recover
 
 _UNFINISHED = SESSION_SUFFIX + PARTIAL_SUFFIX
 _DRAFT = ".recovering" + _UNFINISHED
 _LARGEST_BYTES = 100_000_000  # recovering that much takes one second, with tiny images five
 _TIMEOUT_S = 5.0  # for all of them together: a run is unfinished
-_CLEANUP_TIMEOUT_S = 1.0  # for a terminated recovery to remove its draft
-_REFUSED = 3  # exit status of the recovery process if it reports in one line why nothing can be recovered
 _NAMED = 3  # are reported by name, the others by number
+
+
+class _PostponedError(FlowrecError):
+    """A recovery that takes longer, or more memory, than a run that is about to begin has for it."""
 
 
 def leftovers(folder: Path) -> list[Path]:
@@ -61,14 +59,17 @@ def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> 
                 postponed.append(path)
                 continue
             try:
-                done, summary = _recover_in_process(path, left_s)
-            except subprocess.TimeoutExpired:
+                # In a process of its own: the run starts even if an old file makes that hang.
+                with BoundedProcess(str(path), left_s, error=_PostponedError, by_clock=True) as process:
+                    done = process.call(recover, path)
+            except _PostponedError:
                 postponed.append(path)
             except FlowrecError as error:
                 warn(f"left from a run that did not finish: {error}")
             else:
-                recovered[done] = summary
-                say(f"recovered {done} from a run that did not finish: {summary}")
+                recovered[done.path] = summary = _summary(done)
+                say(f"recovered {done.path} from a run that did not finish: {summary}")
+        _remove_drafts(folder)
     for path in postponed[:_NAMED]:
         warn(
             f"{path} ({_size(path) / 1e6:.0f} MB) is left from a run that did not finish; "
@@ -79,54 +80,16 @@ def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> 
     return recovered
 
 
-def _recover_in_process(path: Path, limit_s: float) -> tuple[Path, str]:
-    """Recover in a separate process; return the session and a summary.
-
-    The live run starts even if an old file makes that process hang or run out of memory.
-
-    Raises
-    ------
-    TimeoutExpired : it took longer than `limit_s`; the process has ended, the old file is unchanged.
-    FlowrecError : nothing could be recovered.
-    """
-    try:
-        process = subprocess.Popen(  # noqa: S603 - a module of flowrec
-            child_command("flowrec.verbs.auto_recovery", str(path.resolve())),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,  # Ctrl-C reaches this process only, which then ends the other one
-            env=child_environment(),
-        )
-    except OSError as error:
-        raise FlowrecError(f"{path}: recovering it does not start ({error.strerror or error})") from error
-    try:
-        out, errors = process.communicate(timeout=limit_s)
-    finally:
-        if process.poll() is None:
-            process.terminate()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_CLEANUP_TIMEOUT_S)
-            process.kill()
-            process.communicate()
-    if process.returncode:
-        last = (errors.strip().splitlines() or [f"exit status {process.returncode}"])[-1]
-        raise FlowrecError(last if process.returncode == _REFUSED else f"{path}: recovering it failed ({last})")
-    name, summary = json.loads(out)
-    return path.with_name(name), summary
-
-
-def _main(path: Path) -> None:
-    """Main function of the process that recovers one file."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the draft is removed on the way out
-    try:
-        done = recover(path)
-    except FlowrecError as error:
-        sys.stderr.write(f"{error}\n")
-        sys.exit(_REFUSED)
+def _summary(done: Recovered) -> str:
     lost = f"; lost: {done.lost}" if done.lost else ""
-    json.dump([done.path.name, f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}"], sys.stdout)
+    return f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}"
+
+
+def _remove_drafts(folder: Path) -> None:
+    """Remove what recoveries that were ended have left."""
+    for draft in folder.glob(f"*{_DRAFT}"):
+        with contextlib.suppress(OSError):  # another process writes it, or it is of another user
+            remove_idle(draft)
 
 
 def _size(path: Path) -> int:
@@ -151,7 +114,3 @@ def _folder_lock(folder: Path) -> Iterator[bool]:
         yield locked
     finally:
         os.close(descriptor)
-
-
-if __name__ == "__main__":
-    _main(Path(sys.argv[1]))

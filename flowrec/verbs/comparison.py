@@ -355,8 +355,7 @@ def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> F
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))
         ratio = np.abs(a - b) / (atol + rtol * np.abs(a))
-    excess: Floats = np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
-    return excess
+    return np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
 
 
 def _form(value: object) -> object:

@@ -52,8 +52,7 @@ def report(
     if isinstance(session, Path | str) and Path(session).suffix == ".parquet":
         if replays or figures is not None:
             raise UsageError(f"{session}: the page of a sweep goes without replays and --figures")
-        page: Path = from_above("report_sweep")(Path(session), None if out is None else Path(out), overwrite)
-        return page
+        return from_above("report_sweep")(Path(session), None if out is None else Path(out), overwrite)
     require_packages()
     from flowrec.verbs.report_page import write_report
 

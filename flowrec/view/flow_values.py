@@ -94,5 +94,4 @@ def flow_arrows(scene: Scene, field: FlowField, grid: tuple[Floats, float]) -> t
 
 def _length(vectors: NDArray[np.floating]) -> Floats:
     """Length (...) of vectors (..., 2)."""
-    length: Floats = np.hypot(vectors[..., 0], vectors[..., 1])
-    return length
+    return np.hypot(vectors[..., 0], vectors[..., 1])

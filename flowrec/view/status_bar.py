@@ -179,8 +179,7 @@ def _text_mask(text: str, height_px: int) -> Picture:
         stem = font.getlength(shown[:place]) + left + 0.5
         tail = (stem, 0.5 * (top + bottom), stem + _STEM * height_px, bottom + _TAIL * height_px)
         draw.rectangle(tuple(map(round, tail)), fill=255)
-    mask: Picture = np.asarray(picture)
-    return mask
+    return np.asarray(picture)
 
 
 def _clock_mask(text: str, height_px: int) -> Picture:

@@ -11,7 +11,7 @@ from flowrec.bench.flow import make_up
 from flowrec.bench.harness import need_matplotlib
 from flowrec.bench.vessel_truth import read_observations
 from flowrec.core.errors import ChipError, UsageError
-from flowrec.physics.chip.vessel_case import read_vessel_case
+from flowrec.physics.chip.io import read_vessel_case
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.refine import Pinn, Refiner
 

@@ -5,7 +5,7 @@ from scipy.ndimage import label
 from flowrec.bench.vessel_truth import read_observations, read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case, thin
 from flowrec.core.errors import ChipError
-from flowrec.physics.chip.vessel_case import read_vessel_case
+from flowrec.physics.chip.io import read_vessel_case
 from flowrec.physics.flow.solver import FlowSolver
 
 EIGHT = np.ones((3, 3))

@@ -17,7 +17,7 @@ from flowrec.bench.harness import Results, run, vessel_cases
 from flowrec.bench.vessel_truth import read_true_chip, read_true_velocity
 from flowrec.core.errors import UsageError
 from flowrec.core.terminal import table
-from flowrec.physics.chip.vessel_case import read_vessel_case
+from flowrec.physics.chip.io import read_vessel_case
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.refine.discretisation_error import local_rms
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -264,6 +263,7 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
 ) -> None:
     left = tmp_path / "left.mcap.partial"
     left.write_bytes(session.read_bytes()[: session.stat().st_size // 2])
+    left.with_name("left.recovering.mcap.partial").write_bytes(b"")  # of one that was ended a little later
     threads, files = set(threading.enumerate()), set(Path("/dev/fd").iterdir())
     monkeypatch.setattr("flowrec.verbs.auto_recovery._TIMEOUT_S", 0.05)
     assert recover_leftovers(tmp_path) == {}
@@ -271,23 +271,6 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
     assert set(threading.enumerate()) <= threads
     assert set(Path("/dev/fd").iterdir()) <= files
     assert [path.name for path in tmp_path.iterdir()] == [left.name]
-
-
-def test_a_recovery_that_hears_no_signal_is_killed(
-    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left, ended = tmp_path / "left.mcap.partial", tmp_path / "ended"
-    left.write_bytes(session.read_bytes())
-    deaf = (
-        "import pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
-        f"time.sleep(20); pathlib.Path({str(ended)!r}).touch()"
-    )
-    monkeypatch.setattr("flowrec.verbs.auto_recovery.child_command", lambda *_: [sys.executable, "-c", deaf])
-    monkeypatch.setattr("flowrec.verbs.auto_recovery._TIMEOUT_S", 2.0)
-    monkeypatch.setattr("flowrec.verbs.auto_recovery._CLEANUP_TIMEOUT_S", 0.1)
-    assert recover_leftovers(tmp_path) == {}
-    assert not ended.exists()
-    assert left.exists()
 
 
 def test_remains_that_are_too_large_are_offered_and_left_alone(

@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from flowrec.core.diagnostics import CameraLosses
 from flowrec.physics.chip.chip import ChipSettings
 from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.orientation import AS_STATED, ORIENTATIONS, Orientation
-from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.chip.registration import AS_STATED, ORIENTATIONS, Calibration, Orientation
 from flowrec.rigs.lab.cameras import probe as camera
 from flowrec.rigs.lab.cameras.camera import CameraInfo
 from flowrec.stages.config import Config, load_config, registration_of, with_sets

@@ -16,14 +16,22 @@ from dataclasses import replace
 from typing import Any
 
 from flowrec.archive.sweep.tasks import Task, change_of, content_of
-from flowrec.core import ChildProcess, FlowrecError, Parent, SessionError, forget_peak, peak_mb, printable
+from flowrec.core import (
+    ChildEndedError,
+    ChildProcess,
+    FlowrecError,
+    Parent,
+    SessionError,
+    forget_peak,
+    peak_mb,
+    printable,
+)
 
 Row = dict[str, Any]
 
 _READY = "ready"
 _START_S = 600.0  # a new installation compiles its kernels
 _PERIOD_S = 0.1  # between two looks at the memory
-_JOIN_S = 5.0
 _ATTEMPTS = 2  # a task that has ended its process so often is set aside
 
 _of_thread = threading.local()
@@ -92,18 +100,14 @@ class _Process:
 
     def __init__(self) -> None:
         self.lasted_s, self.peak_bytes = 0.0, 0
-        self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._child = ChildProcess("flowrec.archive.sweep.replay_process")
         atexit.register(self._end)
-        self._receiver = threading.Thread(target=self._receive, name="replay process", daemon=True)
-        self._receiver.start()
         self._wait(time.monotonic(), _START_S, None)
 
     def row(self, task: Task) -> Row:
         """The row of a task; _EndedError if the process has ended before."""
         self.peak_bytes, began_s = 0, time.monotonic()
-        with contextlib.suppress(OSError):  # it has ended; the receiver reports that
-            self._child.send(task)
+        self._child.send(task)
         try:
             row: Row = self._wait(began_s, task.timeout_s, task.memory_bytes)
         finally:
@@ -115,14 +119,13 @@ class _Process:
 
         while True:
             try:
-                answer = self._answers.get(timeout=_PERIOD_S)
+                return self._child.receive(_PERIOD_S)
             except queue.Empty:
                 pass
-            else:
-                if answer is None:
-                    raise _EndedError(self._cause())
-                return answer
-            with contextlib.suppress(psutil.Error):  # it has ended; the receiver reports that
+            except ChildEndedError as error:
+                self._end()
+                raise _EndedError(str(error)) from error
+            with contextlib.suppress(psutil.Error):  # it has ended, which the next turn tells
                 self.peak_bytes = max(self.peak_bytes, psutil.Process(self._child.process.pid).memory_info().rss)
             if timeout_s is not None and time.monotonic() - began_s > timeout_s:
                 self._end()
@@ -131,22 +134,8 @@ class _Process:
                 self._end()
                 raise _LimitError(f"it needed more than {memory_bytes / 1e9:.3g} GB (--memory), and was ended")
 
-    def _receive(self) -> None:
-        try:
-            while True:
-                self._answers.put(self._child.receive())
-        except (OSError, EOFError, pickle.UnpicklingError):
-            self._answers.put(None)
-
-    def _cause(self) -> str:
-        how, last = self._child.cause(), self._child.last_line
-        self._end()
-        return f"{how}: {last}" if last else how
-
     def _end(self) -> None:
         atexit.unregister(self._end)
-        self._child.process.kill()
-        self._receiver.join(_JOIN_S)  # it reads to the end of the pipe
         self._child.close()
 
 

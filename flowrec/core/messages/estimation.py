@@ -64,7 +64,7 @@ class Health(Message):
     rolled_sums: Annotated[
         Vector,
         Shape("m"),
-        "Motion per revolution, see estimation/step_out.py. (4,) exponential sums: um rolled along the heading, um "
+        "Motion per revolution, which shows step-out. (4,) exponential sums: um rolled along the heading, um "
         "expected from the revolutions, um by which the map's flow carried the robot, s. (0,): none yet, or not "
         "recorded.",
     ] = NOT_STATED

@@ -236,8 +236,7 @@ def fluid_of(field: FlowField) -> NDArray[np.bool_]:
     """(h, w) where a field has fluid; of a field that does not state its walls, where it flows."""
     if field.wall_px is not None:
         return field.wall_px > 0
-    moving: NDArray[np.bool_] = np.any(field.velocity_um_s != 0, axis=-1)
-    return moving
+    return np.any(field.velocity_um_s != 0, axis=-1)
 
 
 def _arrows(axes: Axes, field: FlowField, fluid: NDArray[np.bool_]) -> None:

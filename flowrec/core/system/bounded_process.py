@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 import pickle
+import queue
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from flowrec.core.errors import FlowrecError, UsageError
-from flowrec.core.system.child_process import ChildProcess, Parent
+from flowrec.core.system.child_process import ChildEndedError, ChildProcess, Parent
 
 Answer = TypeVar("Answer")
 
@@ -34,14 +34,21 @@ class BoundedProcess:
     cpu_s : CPU time of each call.
     memory_bytes : of the child, beyond what it takes before it reads anything.
     error : what is raised when the file can not be read within the limits, or at all.
+    by_clock : the time is that of the clock on every system: of work that may wait for a disk.
     """
 
     def __init__(
-        self, where: str, cpu_s: float, memory_bytes: int = MEMORY_BYTES, error: type[FlowrecError] = UsageError
+        self,
+        where: str,
+        cpu_s: float,
+        memory_bytes: int = MEMORY_BYTES,
+        error: type[FlowrecError] = UsageError,
+        *,
+        by_clock: bool = False,
     ) -> None:
         self._where, self._cpu_s, self._memory_bytes, self._error = where, cpu_s, memory_bytes, error
+        self._clock_s = cpu_s if by_clock or sys.platform == "win32" else None
         self._child: ChildProcess | None = None
-        self._late = False  # ended by the clock, where the system limits no CPU time
 
     def call(self, function: Callable[..., Answer], *given: Any) -> Answer:
         """The result of a function of a module, called in the child.
@@ -51,22 +58,19 @@ class BoundedProcess:
         FlowrecError : that of the function; or `error`, where it raised another, or went beyond a limit.
         """
         child = self._child = self._child or self._start_child()
-        timer = threading.Timer(self._cpu_s, self._end_late, (child,))
         try:
-            if sys.platform == "win32":
-                timer.start()
             self.begin(function, *given)
-            answer, failure = child.receive()
-        except (OSError, EOFError, pickle.UnpicklingError) as error:
-            raise self._error(f"{self._where}: {self._cause(child)}") from error
-        finally:
-            timer.cancel()
+            answer, failure = child.receive(self._clock_s)
+        except queue.Empty:
+            child.process.kill()
+            answer, failure = None, "time"
+        except ChildEndedError as error:
+            raise self._error(f"{self._where}: {self._cause(error)}") from error
         if isinstance(failure, FlowrecError):
             raise failure
         if failure:
             raise self._error(f"{self._where}: {self._words(failure)}")
-        result: Answer = answer
-        return result
+        return answer
 
     def begin(self, function: Callable[..., object], *given: Any) -> None:
         """Have a function called of which only an effect is wanted, such as a filled cache: nobody waits for it."""
@@ -91,19 +95,13 @@ class BoundedProcess:
         except OSError as error:
             raise self._error(f"{self._where}: no process starts to read it ({error.strerror or error})") from error
 
-    def _end_late(self, child: ChildProcess) -> None:
-        self._late = True
-        child.process.kill()
-
-    def _cause(self, child: ChildProcess) -> str:
+    def _cause(self, ended: ChildEndedError) -> str:
         """Reason that the child has ended without an answer."""
-        how = child.cause().removeprefix("killed by ").removeprefix("exit ")
-        if self._late or how == "SIGXCPU":
-            return self._words("time")
-        if how == "SIGKILL":
-            return self._words("memory")
-        last = child.last_line
-        return f"its reader has ended ({how}{': ' + last[:300] if last else ''}); the file is damaged"
+        limit = {"killed by SIGXCPU": "time", "killed by SIGKILL": "memory"}.get(ended.how)
+        if limit is not None:
+            return self._words(limit)
+        how = str(ended).removeprefix("killed by ").removeprefix("exit ")
+        return f"its reader has ended ({how}); the file is damaged"
 
     def _words(self, failure: str) -> str:
         if failure == "time":

@@ -17,7 +17,22 @@ from typing import Any
 from flowrec.core.system.processes import start_child
 
 _PRINTED_BYTES = 65_536  # the last part of what the process printed
+_LINE_LETTERS = 300  # of its last line
 _JOIN_S = 5.0
+
+
+class ChildEndedError(Exception):
+    """The process has ended without an answer.
+
+    Attributes
+    ----------
+    how : as "killed by SIGKILL" or "exit status 1".
+    last_line : the last one that it has printed; '' if there is none.
+    """
+
+    def __init__(self, how: str, last_line: str) -> None:
+        super().__init__(how + (f": {last_line[:_LINE_LETTERS]}" if last_line else ""))
+        self.how, self.last_line = how, last_line
 
 
 class ChildProcess:
@@ -46,33 +61,37 @@ class ChildProcess:
     ) -> None:
         self.process = start_child(module, *words, environment=environment, stderr=subprocess.PIPE, pass_fds=inherited)
         self.printed = b""
-        self._collector = threading.Thread(target=self._collect, name=module, daemon=True)
+        self._answers: queue.SimpleQueue[tuple[Any, Exception | None]] = queue.SimpleQueue()
+        self._collector, self._receiver = (
+            threading.Thread(target=target, name=module, daemon=True) for target in (self._collect, self._receive)
+        )
         self._collector.start()
+        self._receiver.start()
 
     def send(self, order: object) -> None:
-        """Send an object. OSError : the process has ended; what pickle raises: the object can not be sent."""
+        """Send an object. To a process that has ended nothing is sent: its answer says so.
+
+        What pickle raises: the object can not be sent.
+        """
         assert self.process.stdin is not None
-        self.process.stdin.write(pickle.dumps(order, pickle.HIGHEST_PROTOCOL))
-        self.process.stdin.flush()
+        pickled = pickle.dumps(order, pickle.HIGHEST_PROTOCOL)
+        with contextlib.suppress(OSError):
+            self.process.stdin.write(pickled)
+            self.process.stdin.flush()
 
-    def receive(self) -> Any:
-        """Wait for the next answer. OSError, EOFError, UnpicklingError : the process has ended."""
-        assert self.process.stdout is not None
-        return pickle.load(self.process.stdout)  # noqa: S301 - from our own process
+    def receive(self, timeout_s: float | None = None) -> Any:
+        """Wait for the next answer.
 
-    def cause(self) -> str:
-        """The way in which it has ended, as "killed by SIGKILL" or "exit status 1"."""
-        try:
-            status = self.process.wait(_JOIN_S)
-        except subprocess.TimeoutExpired:
-            return "its pipe is closed"
-        self._collector.join(_JOIN_S)
-        return f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-
-    @property
-    def last_line(self) -> str:
-        """The last line that it has printed; '' if there is none."""
-        return self.printed.decode(errors="replace").strip().rpartition("\n")[2]
+        Raises
+        ------
+        queue.Empty : there is none in that time.
+        ChildEndedError : there will be none. What pickle raises: it can not be read.
+        """
+        answer, error = self._answers.get(timeout=timeout_s)
+        if error is not None:
+            self._answers.put((None, error))  # for the next call, too
+            raise error
+        return answer
 
     def finish(self) -> None:
         """Close its stdin, and wait until it has ended by itself."""
@@ -86,11 +105,30 @@ class ChildProcess:
         """End the process at once."""
         self.process.kill()
         self.process.wait()
-        self._collector.join(_JOIN_S)
+        self._receiver.join(_JOIN_S)
         for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
             assert pipe is not None
             with contextlib.suppress(OSError):  # the unread part of an order
                 pipe.close()
+
+    def _receive(self) -> None:
+        assert self.process.stdout is not None
+        try:
+            while True:
+                self._answers.put((pickle.load(self.process.stdout), None))  # noqa: S301 - from our own process
+        except (OSError, EOFError, pickle.UnpicklingError):
+            self._answers.put((None, self._end()))
+        except Exception as error:  # noqa: BLE001  nobody may wait for ever
+            self._answers.put((None, error))
+
+    def _end(self) -> ChildEndedError:
+        try:
+            status = self.process.wait(_JOIN_S)
+        except subprocess.TimeoutExpired:
+            return ChildEndedError("its pipe is closed", "")
+        self._collector.join(_JOIN_S)
+        how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        return ChildEndedError(how, self.printed.decode(errors="replace").strip().rpartition("\n")[2])
 
     def _collect(self) -> None:
         assert self.process.stderr is not None

@@ -29,8 +29,7 @@ DEFAULT_INLET_UM_S = 200.0
 
 def border(image: NDArray[Any], side: Side) -> NDArray[Any]:
     """View of one side of an image (h, w): from the top for left and right, from the left for top and bottom."""
-    line: NDArray[Any] = {"left": image[:, 0], "right": image[:, -1], "top": image[0], "bottom": image[-1]}[side]
-    return line
+    return {"left": image[:, 0], "right": image[:, -1], "top": image[0], "bottom": image[-1]}[side]
 
 
 def fluid_runs(line: Bools) -> list[tuple[int, int]]:

@@ -66,13 +66,12 @@ def factorise(matrix: Any) -> Factors:
     if matrix.shape[0] == 0:  # a channel of one cell between inlets has no degree of freedom
         return _EmptyFactors()
     separate_large_blocks()
-    factors: Factors = scipy.sparse.linalg.splu(
+    return scipy.sparse.linalg.splu(
         scipy.sparse.csc_matrix(matrix),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.01,
         options={"SymmetricMode": True},
     )
-    return factors
 
 
 class _Entry:

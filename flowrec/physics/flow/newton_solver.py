@@ -247,8 +247,7 @@ def system(chip: Chip, k: int) -> System:
             return newton_equations(chip, k)
         return with_friction(system(replace(chip, friction_per_um2=None), k), chip.friction_per_um2, chip.um_per_px)
 
-    equations: System = compute_cached(("system", *geometry_key(chip, k)), compute)
-    return equations
+    return compute_cached(("system", *geometry_key(chip, k)), compute)
 
 
 def geometry_key(chip: Chip, k: int) -> tuple[Hashable, ...]:

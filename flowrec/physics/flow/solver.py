@@ -82,8 +82,7 @@ class FlowSolver:
             self._check(chip)
             return sensitivities(*self._steady(chip), friction, shapes, law)
 
-        expansion: Sensitivities = compute_cached((self, chip_key(chip), friction, shapes, law), compute)
-        return expansion
+        return compute_cached((self, chip_key(chip), friction, shapes, law), compute)
 
     def _steady(self, chip: Chip) -> tuple[System | GeneralisedSystem, Scales, Floats]:
         """Equations of a checked chip, its scales and its fluxes (faces,) in m/s."""

@@ -302,8 +302,7 @@ def _try(zero: Callable[[], str]) -> str:
 def _others_zero(target: str, *words: str) -> Callable[[], str]:
     """The function of another package that takes its own amplifier to zero."""
     module, _, name = target.partition(":")
-    zero: Callable[[], str] = getattr(importlib.import_module(module), name)(*words)
-    return zero
+    return getattr(importlib.import_module(module), name)(*words)
 
 
 def _serial_zero(descriptor: str) -> Callable[[], str]:

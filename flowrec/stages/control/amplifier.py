@@ -54,8 +54,7 @@ class AmplifierSettings:
         Exact for V = R i + L di/dt with V constant over a step: i' = a i + (1 - a) V / R with a = exp(-R step / L).
         V is a weighted mean of R i + L di/dt over the step, so it never exceeds the maximum of that expression.
         """
-        voltages: Floats = self.ohm * currents_a[:-1] + self.slope_ohm(step_s) * np.diff(currents_a, axis=0)
-        return voltages
+        return self.ohm * currents_a[:-1] + self.slope_ohm(step_s) * np.diff(currents_a, axis=0)
 
     def slope_ohm(self, step_s: float) -> Floats:
         """(3,) output volts per ampere of change within a step, besides R times the current at its beginning.

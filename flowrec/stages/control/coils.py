@@ -122,8 +122,7 @@ class Coils:
         """
         limits = field_limits(self)
         weight = np.minimum(np.asarray(amplitude_mt) / self.fade_mt, 1.0)
-        currents: Floats = field_mt @ limits.inverse.T - weight[..., None] * limits.bias_a
-        return currents
+        return field_mt @ limits.inverse.T - weight[..., None] * limits.bias_a
 
     def output_samples(self, state: FieldState, command: FieldCommand, count: int) -> tuple[Floats, Floats]:
         """Currents (count + 1, 3) at the output samples from now on, and the voltages (count, 3) held in between."""

@@ -170,14 +170,12 @@ class FieldLog:
             return np.zeros((*stamps.shape, 2))
         row = np.maximum(np.searchsorted(self.times_ns, stamps, "right") - 1, 0)
         since_s = np.maximum(stamps - self._times_ns[row], 0) / NS_PER_S
-        result: Floats = self._turns[row] + self._rates(row) * since_s[..., None]
-        return result
+        return self._turns[row] + self._rates(row) * since_s[..., None]
 
     def turns(self, from_ns: int, to_ns: int) -> Floats:
         """(2,) revolutions along x and y between two stamps; see `turns_until`."""
         begin, end = self.turns_until(np.array([from_ns, to_ns], np.int64))
-        difference: Floats = end - begin
-        return difference
+        return end - begin
 
     def applied_at(self, stamp_ns: int, before_ns: int | None) -> Applied:
         """The message of a frame: the field at its stamp, and the turns since the previous frame (None: the first)."""

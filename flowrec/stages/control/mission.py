@@ -32,15 +32,19 @@ from flowrec.core import (
     seconds,
 )
 from flowrec.physics import Robot
-from flowrec.stages.control.mission_goals import (
+from flowrec.stages.control.mission_steps import (
+    IN_VIEW,
+    MissionFrame,
     confirm_goal,
+    end_if_lost,
     is_asked,
     is_current,
+    note_swept,
     on_the_way,
     refuse_goal,
     with_goal,
+    without_sight,
 )
-from flowrec.stages.control.mission_steps import IN_VIEW, MissionFrame, end_if_lost, note_swept, without_sight
 from flowrec.stages.control.trajectory import position_at
 
 PhaseName = Literal[Phase.SURVEY, Phase.REFINE, Phase.PLAN, Phase.NAVIGATE, Phase.OBSERVE]

@@ -115,8 +115,7 @@ class Sampler:
         UsageError : `method` is not in the table.
         """
         options = SAMPLERS[self.method].options
-        treated: Observations = getattr(self, options[0]).treat(observations) if options else observations
-        return treated
+        return getattr(self, options[0]).treat(observations) if options else observations
 
     def collect(
         self, previous: Observations | None, before: Estimate | None, estimate: Estimate, robot: Robot

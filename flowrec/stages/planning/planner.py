@@ -176,8 +176,7 @@ class Planner:
             able = " or ".join(f"'{other.name}'" for other in PLANNERS.values() if "cost" in other.options)
             raise UsageError(f"plan: {self.method} knows no energy; cost = 'energy' goes with method = {able}")
         check_ranges(self, "plan")
-        method: PlanningMethod = row.build(self)
-        return method
+        return row.build(self)
 
 
 def _as_found(robot: Robot, field: FlowField) -> Robot:

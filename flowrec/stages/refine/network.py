@@ -30,7 +30,7 @@ class ConvBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, b, h, w) of x (n, a, h, w)."""
-        return self.layers(x)  # type: ignore[no-any-return]
+        return self.layers(x)
 
 
 class UNet(nn.Module):
@@ -126,7 +126,7 @@ class CoordinateNet(nn.Module):
         *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for w, b in hidden:
             h = torch.tanh(h @ w.T + b)
-        return h @ weight.T + bias  # type: ignore[no-any-return]
+        return h @ weight.T + bias
 
     def jet(self, points: Tensor) -> Tensor:
         """(4, n, 3) of points (n, 2): value, slope along x, slope along y, Laplacian."""

@@ -138,8 +138,7 @@ class Tracker:
         """The method of another package, if one is chosen."""
         if self.method is None or TRACKERS.own(self.method):
             return None
-        method: TrackingMethod = TRACKERS[self.method].build(self)
-        return method
+        return TRACKERS[self.method].build(self)
 
     def not_found_note(self, appearance: Appearance | None) -> str:
         """Advice for a robot that is not found; '' in a session that had no such note."""

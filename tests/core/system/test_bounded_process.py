@@ -4,6 +4,7 @@ import operator
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -43,10 +44,19 @@ def test_a_file_that_takes_more_time_than_it_may_is_refused():
         process.call(sum, range(10**12))
 
 
+def test_work_that_waits_for_a_disk_is_ended_by_the_clock():
+    late = pytest.raises(UsageError, match=r"^a\.bin: takes more than 0\.5 s")
+    with BoundedProcess("a.bin", 0.5, by_clock=True) as process, late:
+        process.call(time.sleep, 60.0)
+    assert process._child.process.poll() is not None
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="a process ends by no signal there")
 def test_a_reader_that_crashes_takes_nobody_with_it():
-    with BoundedProcess("a.bin", 10.0) as process, pytest.raises(UsageError, match=r"its reader has ended \(SIGABRT"):
-        process.call(os.abort)
+    with BoundedProcess("a.bin", 10.0, by_clock=True) as process:
+        for work in (os.abort, os.getpid):  # the second one does not wait for a process that has ended
+            with pytest.raises(UsageError, match=r"its reader has ended \(SIGABRT"):
+                process.call(work)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a process ends by no signal there")

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from flowrec.core.errors import ChipError
-from flowrec.physics.chip.io import chip_from_files
-from flowrec.physics.chip.vessel_case import KEYS as CASE_KEYS
-from flowrec.physics.chip.vessel_case import read_vessel_case
+from flowrec.physics.chip.io import KEYS as CASE_KEYS
+from flowrec.physics.chip.io import chip_from_files, read_vessel_case
 
 
 def test_a_mask_that_promises_more_than_it_has_is_refused():

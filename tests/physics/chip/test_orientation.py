@@ -6,8 +6,7 @@ import pytest
 from flowrec.measure.picture_registration import orientation_by_image
 from flowrec.physics.chip.chip import ChipSettings
 from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.orientation import AS_STATED, ORIENTATIONS, nearest
-from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.chip.registration import AS_STATED, ORIENTATIONS, Calibration, nearest
 from flowrec.rigs.simulated.microscope import Microscope
 from flowrec.stages.rig_settings import ResolvedCamera
 from flowrec.stages.simulated_settings import SimulatedImage

@@ -10,7 +10,7 @@ from flowrec.physics.flow.map_error import MapError
 from flowrec.physics.robot import Robot
 from flowrec.stages.control import Controller
 from flowrec.stages.estimation import Kalman
-from flowrec.stages.estimation.step_out import StepOut
+from flowrec.stages.estimation.consistency_monitor import StepOut
 from flowrec.stages.planning import Planner, SurveyPlanner
 from tests.stages.planning import worlds
 

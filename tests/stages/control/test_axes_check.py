@@ -10,7 +10,7 @@ import pytest
 from flowrec.core.enums import Outcome, Phase
 from flowrec.core.system.toml_file import parse_toml
 from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.orientation import AS_STATED, ORIENTATIONS
+from flowrec.physics.chip.registration import AS_STATED, ORIENTATIONS
 from flowrec.rigs.rig import checked_images
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.stages.config import config_from_toml, load_config, to_toml

@@ -6,9 +6,9 @@ import pytest
 from flowrec.core.messages import Demand, Estimate, Route
 from flowrec.physics.chip.clearance import clearance_um
 from flowrec.stages.control import Controller
+from flowrec.stages.control.controller import wall_barrier
 from flowrec.stages.control.delay_compensation import CorrectedFlow, corrected_flow, predict_position
 from flowrec.stages.control.tracking_laws import Situation
-from flowrec.stages.control.wall_barrier import wall_barrier
 from tests.stages.control.plant import CENTRE_UM, ROBOT, field_of, fly, lemniscate, mission, straight, vortex
 
 UNGOVERNED = {"lag_free_radii": 1e9, "lag_full_radii": 2e9}  # the paper's reference does not wait

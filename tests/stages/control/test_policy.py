@@ -10,8 +10,8 @@ from flowrec.physics.flow.sampling import sample
 from flowrec.physics.robot import Robot
 from flowrec.stages.config import load_config
 from flowrec.stages.control import Controller
+from flowrec.stages.control.controller import clearance_and_slope
 from flowrec.stages.control.policy import distance_to_known, steepest_descent
-from flowrec.stages.control.wall_barrier import clearance_and_slope
 from flowrec.stages.planning import Planner
 from flowrec.stages.planning.time_field import TimeField
 from flowrec.store.reader import SessionReader

@@ -9,7 +9,7 @@ from flowrec.core.messages import FlowField
 from flowrec.stages.planning import Planner, travel_time
 from flowrec.stages.planning.cost_rasters import CostRasters
 from flowrec.stages.planning.eikonal import time_field
-from flowrec.stages.planning.wall_band import extend_to_walls
+from flowrec.stages.planning.time_field import extend_to_walls
 from tests.extras import why
 from tests.stages.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, open_water, poiseuille, robot
 

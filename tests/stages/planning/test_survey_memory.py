@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.stages.planning.survey_memory import SurveyMemory
+from flowrec.stages.planning.survey_information import SurveyMemory
 from tests.stages.planning.test_survey_information import UPPER, junction, ordered, planner, unknown
 
 FLOW = np.full((10, 2), 40.0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,9 +118,13 @@ class Camera(Protocol):
     `of(wanted)` of a row's class in CAMERAS makes one; nothing is touched before `open`.
     """
 
+    def __init__(self, wanted: Wanted) -> None:
+        """Keep the settings."""
+
     @classmethod
-    def of(cls, wanted: Wanted) -> Camera:
+    def of(cls, wanted: Wanted) -> Self:
         """The camera that is to be opened with these settings."""
+        return cls(wanted)
 
     def open(self) -> CameraInfo:
         """Find the device, connect, set what is wanted, read it back, and start to acquire.
@@ -143,6 +147,7 @@ class Camera(Protocol):
 
     def discarded(self) -> int:
         """Whole images that the driver has thrown away since `open`, because `grab` was not called soon enough."""
+        return 0
 
     def trigger(self) -> None:
         """Expose one frame, with trigger = 'software'; any thread.

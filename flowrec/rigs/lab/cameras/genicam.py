@@ -14,7 +14,7 @@ from typing import Any
 import viva_genicam as vg
 
 from flowrec.core import RigError
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
+from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Wanted, find_device
 from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
 _DISCOVER_MS = 500
@@ -24,7 +24,7 @@ _SERIAL, _TICKS_HIGH, _CONTROL = (0x00D8, 16), (0x093C, 8), (0x0A00, 4)
 _NS = 1e9  # the clock of a USB3 Vision camera counts ns
 
 
-class GenicamCamera:
+class GenicamCamera(Camera):
     """See camera.Camera."""
 
     def __init__(self, wanted: Wanted) -> None:
@@ -33,10 +33,6 @@ class GenicamCamera:
         self._camera: vg.Camera | None = None
         self._stream: vg.FrameStream | None = None
         self._bits = 8
-
-    @classmethod
-    def of(cls, wanted: Wanted) -> GenicamCamera:
-        return cls(wanted)
 
     def open(self) -> CameraInfo:
         name, device = self._device()

@@ -14,7 +14,7 @@ from pathlib import Path
 from pymmcore_plus import CMMCorePlus
 
 from flowrec.core import RigError, nanoseconds
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, NoCameraError, Wanted, bits_of, difference
+from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, NoCameraError, Wanted, bits_of, difference
 
 _RATES = ("FrameRate", "Frame Rate", "AcquisitionFrameRate", "FramesPerSecond")  # names of one property
 _LABEL = "Camera"
@@ -23,7 +23,7 @@ _POLL_S = 0.0005
 _BELIEVED_S = 60.0  # an image that is said to be older than this has another clock
 
 
-class MmcoreCamera:
+class MmcoreCamera(Camera):
     """See camera.Camera. `Wanted.config` is a configuration file, or "adapter:device" such as DemoCamera:DCam."""
 
     def __init__(self, wanted: Wanted) -> None:
@@ -32,10 +32,6 @@ class MmcoreCamera:
         self._bits = 8
         self._next: int | None = None  # number of the next image
         self._discarded = 0  # missing numbers
-
-    @classmethod
-    def of(cls, wanted: Wanted) -> MmcoreCamera:
-        return cls(wanted)
 
     def open(self) -> CameraInfo:
         wanted = self._wanted

@@ -14,13 +14,22 @@ import cv2
 import numpy as np
 
 from flowrec.core import RigError
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Image, NoCameraError, Wanted, bits_of, difference
+from flowrec.rigs.lab.cameras.camera import (
+    Camera,
+    CameraInfo,
+    Grabbed,
+    Image,
+    NoCameraError,
+    Wanted,
+    bits_of,
+    difference,
+)
 
 _TIMEOUT_MS = 1000
 _COLOUR_NOTE = "the camera sends colours: their luminance is used"
 
 
-class OpencvCamera:
+class OpencvCamera(Camera):
     """See camera.Camera. `Wanted.device` is a number (/dev/videoN), a path or a URL; '' is the first device."""
 
     def __init__(self, wanted: Wanted) -> None:
@@ -30,10 +39,6 @@ class OpencvCamera:
         self._file = False
         self._first: Image | None = None  # read by `open`, which looks at its size
         self._due_s = 0.0
-
-    @classmethod
-    def of(cls, wanted: Wanted) -> OpencvCamera:
-        return cls(wanted)
 
     def open(self) -> CameraInfo:
         wanted = self._wanted
@@ -130,9 +135,6 @@ class OpencvCamera:
 
     def alive(self) -> bool:
         return self._capture is not None and self._capture.isOpened()
-
-    def discarded(self) -> int:
-        return 0
 
     def trigger(self) -> None:
         raise RigError("opencv knows no trigger")

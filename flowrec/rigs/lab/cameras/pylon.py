@@ -15,7 +15,7 @@ with warnings.catch_warnings():
     from pypylon import genicam, pylon
 
 from flowrec.core import RigError
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
+from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Wanted, find_device
 from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
 _BUFFERS = 32
@@ -26,7 +26,7 @@ _NO_ID = (1 << 64) - 1
 _NS = 1e9  # the clock of a USB camera counts ns
 
 
-class PylonCamera:
+class PylonCamera(Camera):
     """See camera.Camera. `Wanted.config` is a feature file of pylon (.pfs), which is loaded first.
 
     Attributes
@@ -39,10 +39,6 @@ class PylonCamera:
         self._wanted = wanted
         self._bits = 8
         self._emulated = False
-
-    @classmethod
-    def of(cls, wanted: Wanted) -> PylonCamera:
-        return cls(wanted)
 
     def open(self) -> CameraInfo:
         factory = pylon.TlFactory.GetInstance()

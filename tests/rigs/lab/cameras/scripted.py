@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flowrec.core.errors import RigError
-from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Wanted
+from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted
 
 INFO = CameraInfo("Scripted", "1", 4, 3, 8, 100.0, id_bits=16)
 WANTED = Wanted(width_px=4, height_px=3, rate_hz=100.0)
@@ -39,7 +39,7 @@ class Scripted:
     opened: int = 0
 
     @classmethod
-    def of(cls, _wanted: Wanted) -> Camera:
+    def of(cls, _wanted: Wanted) -> Scripted:
         return cls()
 
     @classmethod
