@@ -66,18 +66,12 @@ def masked_ncc(
     grey, square, weight, whole = _weighted_blocks(
         image, distance_px, x0 - half * step, y0 - half * step, wide, tall, step, margin_px
     )
-    correlation = np.empty((rows, columns), np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            correlation[row, column] = -1.0
+    correlation = np.full((rows, columns), -1.0, np.float32)
     middle = (step - 1) // 2
     area = np.float32(size * size)
     one = np.float32(1.0)
-    squared, spread = np.empty((size, size), np.float32), np.float32(0.0)
-    for j in range(size):
-        for k in range(size):
-            squared[j, k] = pattern[j, k] * pattern[j, k]
-            spread += squared[j, k]
+    squared = pattern * pattern
+    spread = squared.sum()
     for row in range(rows):
         y = min(y0 + row * step + middle, height - 1)
         first, last = columns, -1
@@ -88,12 +82,8 @@ def masked_ncc(
             continue
         span = last + 1 - first
         sum_i, sum_i2 = _window_sums(grey, row, first, span, size), _window_sums(square, row, first, span, size)
-        open_fluid = True
-        for j in range(size):
-            open_fluid = open_fluid and whole[row + j]
-        cov, sum_m = np.zeros(span, np.float32), np.empty(span, np.float32)
-        for i in range(span):
-            sum_m[i] = area if open_fluid else np.float32(0.0)
+        open_fluid = whole[row : row + size].all()
+        cov, sum_m = np.zeros(span, np.float32), np.full(span, area if open_fluid else np.float32(0.0))
         sum_t, sum_t2 = np.zeros(span, np.float32), np.zeros(span, np.float32)
         for j in range(size):
             for k in range(size):
