@@ -164,6 +164,10 @@ def record(
         return DryRun(
             chosen if short else resolved, short, look_at_lab(chosen, file, path) if chosen.rig == "lab" else None
         )
+    from flowrec.core import MCAP, Output
+
+    if path is not None:
+        Output(path, MCAP, tuple(inputs), overwrite).check()  # before imports and before the flow is solved
     from flowrec.store import refuse_unusable_key, sign_file
     from flowrec.verbs.mission_run import run_mission
 

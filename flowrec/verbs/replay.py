@@ -97,6 +97,10 @@ def replay(
     UsageError : a change that is not possible, or a time outside of the session.
     SessionError : the session can not be read or replayed, or `out` not be written.
     """
+    if isinstance(session, Path | str):
+        from flowrec.store import existing_session
+
+        existing_session(session)  # before imports that take longer than all else of a refusal
     from flowrec.verbs.replay_change import Change
 
     named = Change(refine, plan, observer, controller, sets or ())
@@ -109,10 +113,6 @@ def replay(
         raise MisuseError("--verify only compares; it goes without --refly")
     if jobs != 1 and (change != Change() or out is not None):
         raise MisuseError("--verify --jobs only compares: it goes without --refine, --set, --out ...")
-    if isinstance(session, Path | str):
-        from flowrec.store import existing_session
-
-        existing_session(session)  # before imports that take a second
     from flowrec.verbs.replay_made import make_replay
 
     if jobs != 1:

@@ -38,8 +38,9 @@ def compiled(function: Function) -> Function:
     """The function in machine code; the first call of a new installation takes seconds, later ones load the cache.
 
     What a kernel takes from other files of flowrec, it must take from files with kernels: the cache is keyed by those.
-    A kernel assigns element by element: what is assigned to a slice, `np.where` and `np.interp` take two seconds more
-    to compile, most of it for messages that are never shown.
+    A kernel assigns element by element: what is assigned to a slice or a row, `np.where` and `np.interp` take two
+    seconds more to compile, most of it for messages that are never shown, and `max` of an array half a second. An array
+    that may be written and one that may not are two kinds, for each of which a kernel is compiled.
     """
     return cast(Function, Kernel(function))
 

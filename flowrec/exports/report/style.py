@@ -121,6 +121,9 @@ def as_svg(figure: Figure, title: str, dpi: int = PAGE_DPI, text: Literal["none"
     import matplotlib as mpl
 
     file = io.BytesIO()
+    if (layout := figure.get_layout_engine()) is not None:  # alone: matplotlib would go through a whole drawing for it
+        layout.execute(figure)
+        figure.set_layout_engine("none")
     with mpl.rc_context({"svg.fonttype": text}):
         figure.savefig(file, format="svg", dpi=dpi, metadata={"Title": title, "Date": None})
     svg = _PATH.sub(lambda path: _DECIMALS.sub(rb"\1", path[0]), file.getvalue())

@@ -183,7 +183,9 @@ def pixel_weights(wall_px: NDArray[np.float32], points: Floats) -> tuple[NDArray
     The first of the pixels is the nearest one. Points are in px and inside the raster.
     """
     h, w = wall_px.shape
-    weights = stencils_at(np.ascontiguousarray(wall_px), np.ascontiguousarray(points, np.float64))
+    walls = np.ascontiguousarray(wall_px).view()
+    walls.flags.writeable = False  # as those of a message are: the kernels are compiled for one kind
+    weights = stencils_at(walls, np.ascontiguousarray(points, np.float64))
     corner = np.minimum(np.clip(points, 0.0, [w - 1.0, h - 1.0]).astype(np.intp), [max(w - 2, 0), max(h - 2, 0)])
     columns, rows = (corner[:, axis, None] - _BEFORE + np.arange(SIZE) for axis in (0, 1))
     pixels = np.clip(rows, 0, h - 1)[:, :, None] * w + np.clip(columns, 0, w - 1)[:, None, :]

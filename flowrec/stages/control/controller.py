@@ -106,6 +106,8 @@ def clearance_and_slope(clearance_um: NDArray[np.float32], point_px: Floats) -> 
 
 
 _FOLLOWING = (Phase.SURVEY, Phase.NAVIGATE)
+_NOTHING_SENT = np.zeros((0, 2))
+_NOTHING_SENT.flags.writeable = False  # as the array of a message is: kernels are compiled for either kind
 _LEAST_SPEED = 0.02  # of the robot's limit: a demand below it is zero while the robot is not seen
 
 _LAWS = "flowrec.stages.control.tracking_laws:"
@@ -199,7 +201,7 @@ class Controller:
             return previous
         law = _law(self)
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
-        sent = previous.sent_um_s if previous is not None else np.zeros((0, 2))
+        sent = previous.sent_um_s if previous is not None else _NOTHING_SENT
         lag_s = 0.0 if estimate_uses_map else self.observer_lag_s / speed_ratio(robot)
         flow = corrected_flow(field, estimate, sent, CONTROL.of(field, self.map_error), lag_s)
         now = Situation(

@@ -191,9 +191,9 @@ def best_first(
             if length > 1.5 and min(clearance[j, i], clearance[b, a]) < need + 0.5 * length:
                 # The paper's edges have no direction: their lines are sampled from the lower node.
                 if cost == PAPER and other < node:
-                    clear = line_is_clear(clearance, a, b, i, j, need)
+                    clear = line_is_clear(clearance, float(a), float(b), float(i), float(j), need)
                 else:
-                    clear = line_is_clear(clearance, i, j, a, b, need)
+                    clear = line_is_clear(clearance, float(i), float(j), float(a), float(b), need)
                 if not clear:
                     continue
             edge = _edge_cost(vx, vy, speed, cost, i, j, di, dj)
@@ -214,11 +214,12 @@ def best_first(
 def _fastest_over_ground(vx: Raster, vy: Raster, speed: Raster) -> float:
     """Upper bound in px/s: the fastest flow plus the robot's highest speed."""
     h, w = vx.shape
-    fastest = 0.0
+    fastest, own = 0.0, -math.inf
     for j in range(h):
         for i in range(w):
             fastest = max(fastest, math.hypot(vx[j, i], vy[j, i]))
-    return float(speed.max()) + fastest
+            own = max(own, speed[j, i])
+    return own + fastest
 
 
 @compiled

@@ -133,15 +133,15 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
 def _with_bumps(path: Points, rasters: CostRasters, weight: Raster, spacing: float, widths: Ints) -> Points:
     """The path (n, 2) with its points shifted along the normal by cosine bumps of half widths `widths`, in points.
 
-    A bump is kept if it lowers the cost; the height is halved when hardly any does.
+    The widest comes first. A bump is kept if it lowers the cost; the height is halved when hardly any does.
     """
     clearance = rasters.clearance
     h, w = clearance.shape
     points = path.copy()
     n = len(points)
     costs, floors = _legs(points, rasters, weight)
-    moved = np.empty((2 * widths.max() + 1, 2))
-    new_costs = np.empty(2 * widths.max())
+    moved = np.empty((2 * widths[0] + 1, 2))
+    new_costs = np.empty(2 * widths[0])
     for width in widths:
         height = _FIRST_HEIGHT * width * spacing
         stride = max(1, width // 2)
@@ -155,7 +155,10 @@ def _with_bumps(path: Points, rasters: CostRasters, weight: Raster, spacing: flo
                 norm = math.hypot(tangent_x, tangent_y)
                 if norm < 1e-9:
                     continue
-                limit = costs[first:last].sum() * (1.0 - 1e-7)
+                limit = 0.0
+                for k in range(first, last):
+                    limit += costs[k]
+                limit *= 1.0 - 1e-7
                 for sign in (-1.0, 1.0):
                     good = True
                     for k in range(first, last + 1):

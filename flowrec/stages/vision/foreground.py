@@ -179,7 +179,7 @@ def peaks(values: NDArray[np.float32], least: float, apart: int, most: int) -> N
                 continue
             place = min(n, most - 1)
             while place > 0 and found[place - 1, 2] < value:
-                found[place] = found[place - 1]
+                found[place, 0], found[place, 1], found[place, 2] = found[place - 1]
                 place -= 1
             found[place, 0], found[place, 1], found[place, 2] = i, j, value
             n = min(n + 1, most)
