@@ -71,7 +71,12 @@ class Sizes:
         """(effects, effects) the inverse of the expected information."""
         count = len(self.mode)
         inverse = np.linalg.inv(self.model.covariance(self.mode))
-        scaled = 2.0 * np.exp(2.0 * self.mode)[:, None, None] * (inverse @ self.model.matrices)
+        # C^-1 G of each; of few unknowns in two thin products.
+        parts = [
+            inverse @ one.matrix if one.kernel is not None else (inverse @ one.columns.T) @ one.columns
+            for one in self.model.effects
+        ]
+        scaled = 2.0 * np.exp(2.0 * self.mode)[:, None, None] * np.stack(parts)
         # Half of the traces of the products of each two.
         products = scaled.reshape(count, -1) @ scaled.transpose(0, 2, 1).reshape(count, -1).T
         information = np.diag(1.0 / self.model.ln_stds**2) + 0.25 * (products + products.T)
@@ -118,8 +123,8 @@ class EffectModel:
         points = sizes.mode + normal @ root.T
         points = np.clip(points, medians + RANGE[0] * stds, medians + RANGE[1] * stds)
         ln_weight = np.empty(len(points))
-        for index, point in enumerate(points):
-            factor, solved = self._factorise(point)
+        factors = [self._factorise(point) for point in points]
+        for index, (point, (factor, solved)) in enumerate(zip(points, factors, strict=True)):
             value = -0.5 * float(self.y @ solved) - float(np.log(np.diag(factor)).sum())
             value -= 0.5 * len(self.y) * np.log(2.0 * np.pi)
             ln_prior = -0.5 * float((((point - medians) / stds) ** 2).sum()) - float(np.log(stds).sum())
@@ -132,10 +137,9 @@ class EffectModel:
         evidence = top + float(np.log(np.exp(ln_weight - top).mean()))
         weight /= weight.sum()
         mean, square = np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
-        for share, point in zip(weight, points, strict=True):
+        for share, point, (factor, solved) in zip(weight, points, factors, strict=True):
             if share < NEGLIGIBLE * weight.max():
                 continue
-            factor, solved = self._factorise(point)
             variance = np.exp(2.0 * point)[owner]
             effect = variance[:, None] * columns
             one = effect @ solved
