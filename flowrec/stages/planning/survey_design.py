@@ -185,8 +185,8 @@ class Looks:
         in_patch[index, np.arange(len(index))] = weight
         added_weights = in_patch.sum(axis=1)
         least = added_weights / np.maximum(in_patch @ error**2, 1e-300)
-        before, weights = self.sums[patches].reshape(len(patches), -1), self.weights[patches]
-        after = before + in_patch @ effect.reshape(len(index), -1)
+        before, weights = self.sums[patches].reshape(len(patches), 2 * unknowns), self.weights[patches]
+        after = before + in_patch @ effect.reshape(len(index), 2 * unknowns)
         shared = [
             (sums / np.sqrt(least + total)[:, None]).reshape(-1, unknowns)
             for sums, total in ((after, weights + added_weights), (before, weights))
