@@ -23,6 +23,7 @@ from flowrec.core import Floats
 
 _MOST_PAIRS = 2_000_000  # of a point and a disc that are compared at once, for the memory that they take
 
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereBetweenWalls:
     """A sphere at each of a number of places. One that is seen nearer to a wall than its radius touches it."""
