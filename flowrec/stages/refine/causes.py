@@ -87,19 +87,19 @@ NEAR_SHARE = 0.5  # of the least distance: over which hindrance falls to 1 / e
 
 @dataclass(frozen=True, eq=False)  # no slots, for what is computed once
 class _There:
-    """What the effects need of the places and times of the observations, whatever flows."""
+    """Parts of the effects that follow from the places and times of the observations alone, whatever flows."""
 
     model: FlowModel
     operator: ObservationOperator  # on the fluid pixels of the model
 
     @cached_property
     def known(self) -> Floats:
-        """(unknowns, n, 2) what boundary values and fluid add to the observations."""
+        """(unknowns, n, 2) that boundary values and fluid add to the observations."""
         return self.operator.predict(self.model.known)
 
     @cached_property
     def resistance(self) -> Floats:
-        """(cells, n, 2) what the resistances add to them."""
+        """(cells, n, 2) that the resistances add to them."""
         return self.operator.predict(self.model.resistance)
 
     @cached_property
