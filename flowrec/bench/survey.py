@@ -114,7 +114,7 @@ def place_information(
     effect = replace(uncertainty, doubts=Doubts.none(0)).effect(pixel, np.zeros((len(pixel), 2)))
     variance = noise_um_s**2 + uncertainty.error_um_s[pixel] ** 2
     need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
-    return need, [effect[:, k] @ effect[:, k].T / variance[k] for k in range(len(pixel))]
+    return need, [effect[k].T @ effect[k] / variance[k] for k in range(len(pixel))]
 
 
 def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Seen:

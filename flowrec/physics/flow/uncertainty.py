@@ -6,6 +6,7 @@ It is not a message: it follows from the recorded observations and is computed a
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ class Registration:
         return np.array([[grown, self.angle_rad], [-self.angle_rad, grown]])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots, for what many ways are weighed by
 class FlowUncertainty:
     """The flow is mean + z columns with z ~ N(0, covariance), on the n fluid pixels of a mask in raster order.
 
@@ -118,12 +119,17 @@ class FlowUncertainty:
         return float(np.sqrt((self.std_um_s**2).sum())) / max(speed, 1e-300)
 
     def effect(self, pixels: NDArray[np.intp], own_um_s: Floats) -> Floats:
-        """(p + r + k, m, 2) what a unit of each unknown, and each doubt, adds to the flow observed in m fluid pixels.
+        """(m, 2, p + r + k) what a unit of each unknown, and each doubt, adds to the flow observed in m fluid pixels.
 
         `own_um_s` (m, 2) is the velocity of the robot through the fluid there.
         """
-        rolled = self.rolled[:, pixels, None] * own_um_s
-        parts = [self.columns_um_s[:, pixels], rolled]
-        if len(self.doubts.probability):
-            parts.append(self.doubts.changes_um_s[:, pixels].astype(np.float64))
-        return np.concatenate(parts)
+        found, first = self._of_pixels[pixels], len(self.columns_um_s)
+        found[:, :, first : first + len(self.rolled)] = self.rolled[:, pixels].T[:, None] * own_um_s[:, :, None]
+        return found
+
+    @cached_property
+    def _of_pixels(self) -> Floats:
+        """(n, 2, p + r + k) `effect` of a robot at rest."""
+        still = np.zeros((len(self.rolled), *self.mean_um_s.shape))
+        changes = self.doubts.changes_um_s.reshape(-1, *self.mean_um_s.shape)
+        return np.ascontiguousarray(np.moveaxis(np.concatenate([self.columns_um_s, still, changes]), 0, 2), np.float64)

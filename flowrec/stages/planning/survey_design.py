@@ -141,7 +141,7 @@ class Looks:
     patch_px : side of a patch.
     share : of the speed of the flow, one standard deviation of the error that looks at a patch share.
     pixel : (h, w) index of each fluid pixel among those of the uncertainty.
-    sums : (patches, q + k, 2) sum of w A so far.
+    sums : (patches, 2, q + k) sum of w A so far.
     weights : (patches,) sum of w so far.
     """
 
@@ -159,7 +159,7 @@ class Looks:
         """No look so far."""
         patches = int(np.prod(np.ceil(np.array(chip.mask.shape) / patch_px)))
         unknowns = len(uncertainty.covariance) + len(uncertainty.doubts.probability)
-        sums = np.zeros((patches, unknowns, 2))
+        sums = np.zeros((patches, 2, unknowns))
         pixel = np.cumsum(chip.mask.ravel()).reshape(chip.mask.shape) - 1
         return cls(uncertainty, sampling, chip, patch_px, share, pixel, sums, np.zeros(patches))
 
@@ -178,24 +178,24 @@ class Looks:
         Each part of the way has as many looks, also less than one, as its length and its duration allow.
         """
         which, weight, effect, error = self._on_way(waypoints_um, arrival_s)
-        unknowns = self.sums.shape[1]
-        scaled = (effect * np.sqrt(weight)[:, None]).reshape(unknowns, -1)
+        unknowns = effect.shape[2]
+        scaled = (effect * np.sqrt(weight)[:, None, None]).reshape(-1, unknowns)
         patches, index = np.unique(which, return_inverse=True)
-        least = 1.0 / np.maximum(np.bincount(index, weight * error**2), 1e-300) * np.bincount(index, weight)
-        before, weights = self.sums[patches], self.weights[patches]
-        order = np.argsort(index, kind="stable")
-        first = np.searchsorted(index[order], np.arange(len(patches)))
-        added = np.add.reduceat(np.moveaxis(effect * weight[:, None], 0, 1)[order], first, axis=0)
-        weights_after = weights + np.bincount(index, weight)
+        in_patch = np.zeros((len(patches), len(index)))
+        in_patch[index, np.arange(len(index))] = weight
+        added_weights = in_patch.sum(axis=1)
+        least = added_weights / np.maximum(in_patch @ error**2, 1e-300)
+        before, weights = self.sums[patches].reshape(len(patches), 2 * unknowns), self.weights[patches]
+        after = before + in_patch @ effect.reshape(len(index), 2 * unknowns)
         shared = [
-            (sums / np.sqrt(least + total)[:, None, None]).transpose(1, 0, 2).reshape(unknowns, -1)
-            for sums, total in ((before + added, weights_after), (before, weights))
+            (sums / np.sqrt(least + total)[:, None]).reshape(-1, unknowns)
+            for sums, total in ((after, weights + added_weights), (before, weights))
         ]
-        return scaled @ scaled.T - shared[0] @ shared[0].T + shared[1] @ shared[1].T
+        return np.asarray(scaled.T @ scaled - shared[0].T @ shared[0] + shared[1].T @ shared[1])
 
     def _after(self, which: NDArray[np.intp], weight: Floats, effect: Floats) -> Looks:
         sums, weights = self.sums.copy(), self.weights.copy()
-        np.add.at(sums, which, np.moveaxis(effect * weight[:, None], 0, 1))
+        np.add.at(sums, which, effect * weight[:, None, None])
         np.add.at(weights, which, weight)
         return replace(self, sums=sums, weights=weights)
 
@@ -210,7 +210,7 @@ class Looks:
     def _looks(
         self, places_um: Floats, velocity_um_s: Floats, count: Floats, over_ground: bool = False
     ) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
-        """Patch (m,), weight (m,), effect (q, m, 2) and shared error (m,) of the looks in fluid."""
+        """Patch (m,), weight (m,), effect (m, 2, q + k) and shared error (m,) of the looks in fluid."""
         shape, mean = self.chip.mask.shape, self.uncertainty.mean_um_s
         rows, columns = nearest_pixels(places_um.reshape(-1, 2) / self.chip.um_per_px, shape)
         fluid = self.chip.mask[rows, columns]

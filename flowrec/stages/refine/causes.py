@@ -27,6 +27,7 @@ so that the observations decide (evidence.py), and an effect that nothing asks f
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -80,7 +81,55 @@ MOST_LINES = 400  # of them, for the time that it takes
 LEAST_PERIODS = 0.5  # of a line in the time that was observed: less is a wander
 FEWEST_FOR_LINE = 12  # observations: amplitude, phase and frequency on top of the flow
 LINE_NAME = "line"
+_HALF_PIXEL = 0.5 * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # here, and to each side
 NEAR_SHARE = 0.5  # of the least distance: over which hindrance falls to 1 / e
+
+
+@dataclass(frozen=True, eq=False)  # no slots, for what is computed once
+class _There:
+    """Parts of the effects that follow from the places and times of the observations alone, whatever flows."""
+
+    model: FlowModel
+    operator: ObservationOperator  # on the fluid pixels of the model
+
+    @cached_property
+    def known(self) -> Floats:
+        """(unknowns, n, 2) that boundary values and fluid add to the observations."""
+        return self.operator.predict(self.model.known)
+
+    @cached_property
+    def resistance(self) -> Floats:
+        """(cells, n, 2) that the resistances add to them."""
+        return self.operator.predict(self.model.resistance)
+
+    @cached_property
+    def apart_px(self) -> Floats:
+        """(n, n) distances."""
+        return np.asarray(np.linalg.norm(self.operator.points[:, None] - self.operator.points, axis=-1))
+
+    @cached_property
+    def alike_in_place(self) -> Floats:
+        """(2 n, 2 n) correlation over the width of a channel."""
+        return _of_components(np.exp(-self.apart_px / self.model.channel_px))
+
+    def alike_in_time(self, length_s: float) -> Floats:
+        """(2 n, 2 n) correlation over a time."""
+        assert self.operator.time_s is not None
+        time_s = self.operator.time_s
+        return _of_components(np.exp(-np.abs(time_s[:, None] - time_s) / length_s))
+
+    @cached_property
+    def local_error(self) -> Floats:
+        """(2 n, 2 n) covariance of the model's own error: neighbours share it."""
+        std = self.operator.predict(np.repeat(self.model.error_std[:, None], 2, axis=1))[:, 0]
+        covariance = np.zeros((len(std), 2, len(std), 2))
+        covariance[:, 0, :, 0] = covariance[:, 1, :, 1] = std[:, None] * std * np.exp(-self.apart_px / NEIGHBOURHOOD_PX)
+        return covariance.reshape(2 * len(std), -1)
+
+
+def _of_components(of_each: Floats) -> Floats:
+    """(2 n, 2 n) of the components of observations, of which (n, n) is the same for both."""
+    return np.repeat(np.repeat(of_each, 2, axis=0), 2, axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +138,7 @@ class Observed:
 
     model: FlowModel
     operator: ObservationOperator  # on the fluid pixels of the model
+    there: _There
     shifted: tuple[ObservationOperator, ...]  # half a pixel to the right, left, down, up
     cells: Floats  # (cells, n) weights of the cells there
     near: Floats  # (n,) b_i: 1 where walls hold the robot back most
@@ -103,17 +153,10 @@ class Observed:
     @classmethod
     def of(cls, model: FlowModel, operator: ObservationOperator, moved: Floats | None = None) -> Observed:
         """The observations of an operator, moved by (n, 2) px. Those in solid are predicted to be at rest."""
-        mask, wall_px = model.chip.mask, model.expansion.wall_px
+        mask = model.chip.mask
         stated, moved = operator, np.zeros_like(operator.points) if moved is None else moved
         operator = replace(operator, points=np.clip(operator.points + moved, 0.0, np.array(mask.shape[::-1]) - 1.0))
-        here = operator.with_walls(wall_px)
-        steps = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        last = np.array(mask.shape[::-1]) - 1.0
-        shifted = tuple(
-            replace(operator, points=np.clip(operator.points + step, 0.0, last)).with_walls(wall_px).on_fluid(mask)
-            for step in steps
-        )
-        here = here.on_fluid(mask)
+        here, *shifted = operator.beside(_HALF_PIXEL, model.expansion.wall_px, mask)
         clearance = np.minimum(clearance_um(mask, 1.0), np.float32(max(mask.shape)))
         distance = np.maximum(cells_at(operator.points, mask.shape).interpolate(clearance), 0.0)
         least = max(float(distance.min()), 0.5)
@@ -124,7 +167,8 @@ class Observed:
             sphere = SphereBetweenWalls.of(operator.radius_px, mask, clearance, operator.points, distance)
             near = sphere.drag / float(sphere.drag.max())
         cells = model.cells[:, here.pixels[:, 0]].toarray()
-        return cls(model, here, shifted, cells, near, least, sphere, model.chip.um_per_px, stated, moved)
+        there = _There(model, here)
+        return cls(model, here, there, tuple(shifted), cells, near, least, sphere, model.chip.um_per_px, stated, moved)
 
     def moved_by(self, registration: Floats) -> Floats:
         """(n, 2) px by which a registration (4,) moves the observations: offset x and y in px, scale, angle in rad."""
@@ -181,18 +225,18 @@ class Observed:
         turned = quarter_turn(away)
         stretch = v + own - np.einsum("an,anc->nc", away.T, gradient)
         turn = quarter_turn(v) - np.einsum("an,anc->nc", turned.T, gradient)
-        known, openings = here.predict(model.known), len(model.chip.openings)
+        known, openings = self.there.known, len(model.chip.openings)
         found = [
             _effect("boundary", BOUNDARY, known[:openings]),
             _effect("fluid", FLUID, known[openings:]),
-            _effect("resistance", RESISTANCE, here.predict(model.resistance)),
+            _effect("resistance", RESISTANCE, self.there.resistance),
             replace(_effect("walls", WALLS, self._widening_flow(v)), kernel=self._beside_walls(v, gradient)),
             *(_effect(WALL_BIAS_NAME, WALL_BIAS, here.predict(mode[None])) for mode in modes),
             _effect("offset", OFFSET_PX, gradient),
             _effect("scale", SCALE, stretch[None]),
             _effect("angle", ANGLE, turn[None]),
             *self._transport_effects(v, flow),
-            Effect("local", *LOCAL, np.zeros((0, v.size)), self.local_error()),
+            Effect("local", *LOCAL, np.zeros((0, v.size)), self.there.local_error),
         ]
         if rolled is not None:
             found += [
@@ -202,14 +246,14 @@ class Observed:
             ]
         if time_s is not None:
             along = v.ravel()[:, None] * v.ravel()
-            apart = np.abs(np.repeat(time_s, 2)[:, None] - np.repeat(time_s, 2))
             none = np.zeros((0, v.size))
             found += [
-                Effect(f"wander {length:g} s", *WANDER, none, along * np.exp(-apart / length)) for length in WANDER_S
+                Effect(f"wander {length:g} s", *WANDER, none, along * self.there.alike_in_time(length))
+                for length in WANDER_S
             ]
             if rolled is not None:
                 pushed = [(vectors.ravel()[:, None] * vectors.ravel()) for vectors in (own, quarter_turn(own))]
-                found.append(Effect("rolling", *ROLLING, none, sum(pushed) * np.exp(-apart / ROLLING_S)))
+                found.append(Effect("rolling", *ROLLING, none, sum(pushed) * self.there.alike_in_time(ROLLING_S)))
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
         noise = float(np.median(here.std_um_s))
@@ -237,8 +281,7 @@ class Observed:
 
     def _widening_flow(self, v: Floats) -> Floats:
         """(cells, n, 2) what walls that are a pixel off in a cell do to the flow v (n, 2), there and elsewhere."""
-        resistance = self.operator.predict(self.model.resistance)
-        both = 3.0 * resistance + self.cells[:, :, None] * v
+        both = 3.0 * self.there.resistance + self.cells[:, :, None] * v
         return np.asarray(-WALLS_LONG * self.model.widening[:, None, None] * both)
 
     def _beside_walls(self, v: Floats, gradient: Floats) -> Floats:
@@ -246,19 +289,9 @@ class Observed:
 
         `v` (n, 2) is the flow, `gradient` (2, n, 2) its derivatives, um/s per px.
         """
-        points = self.operator.points
-        apart = np.linalg.norm(points[:, None] - points, axis=-1)
         wider = np.sqrt(1.0 - WALLS_LONG**2) * (self.model.widening @ self.cells)[:, None] * v
         flat = np.concatenate([gradient, wider[None]]).reshape(3, -1)
-        return np.asarray((flat.T @ flat) * np.kron(np.exp(-apart / self.model.channel_px), np.ones((2, 2))))
-
-    def local_error(self) -> Floats:
-        """(2 n, 2 n) covariance of the model's own error: neighbours share it."""
-        here = self.operator
-        std = here.predict(np.repeat(self.model.error_std[:, None], 2, axis=1))[:, 0]
-        apart = np.linalg.norm(here.points[:, None] - here.points, axis=-1)
-        covariance = std[:, None] * std * np.exp(-apart / NEIGHBOURHOOD_PX)
-        return np.kron(covariance, np.eye(2))
+        return np.asarray((flat.T @ flat) * self.there.alike_in_place)
 
 
 def waves(hz: float, time_s: Floats) -> Floats:

@@ -58,16 +58,38 @@ class Posterior:
     square_sizes: Floats  # (effects,) posterior mean of the square of each size
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots, for what is computed when it is first asked for
 class Sizes:
     """The posterior of ln sizes as a normal distribution, and the ln evidence by Laplace's method."""
 
     mode: Floats  # (effects,)
-    covariance: Floats  # (effects, effects)
-    evidence: float
+    density: float  # ln of likelihood and hyperprior at the mode, but for the constant of the latter
+    model: EffectModel
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(effects, effects) the inverse of the expected information."""
+        count = len(self.mode)
+        inverse = np.linalg.inv(self.model.covariance(self.mode))
+        # C^-1 G of each; of few unknowns in two thin products.
+        parts = [
+            inverse @ one.matrix if one.kernel is not None else (inverse @ one.columns.T) @ one.columns
+            for one in self.model.effects
+        ]
+        scaled = 2.0 * np.exp(2.0 * self.mode)[:, None, None] * np.stack(parts)
+        # Half of the traces of the products of each two.
+        products = scaled.reshape(count, -1) @ scaled.transpose(0, 2, 1).reshape(count, -1).T
+        information = np.diag(1.0 / self.model.ln_stds**2) + 0.25 * (products + products.T)
+        return np.asarray(np.linalg.inv(information), np.float64)
+
+    @cached_property
+    def evidence(self) -> float:
+        """By Laplace: the hyperprior's density is normalised, its constant is in the determinants."""
+        spread = 0.5 * float(np.linalg.slogdet(self.covariance)[1])
+        return self.density + spread - float(np.log(self.model.ln_stds).sum())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots, for the stacked matrices
 class EffectModel:
     """Observations y (m,) with noise of covariance R (m, m), and the effects that may explain them."""
 
@@ -77,13 +99,11 @@ class EffectModel:
 
     def sizes(self, start: Floats | None = None) -> Sizes:
         """The most probable sizes and their uncertainty."""
-        matrices = self._matrices()
-        medians = np.log([effect.median for effect in self.effects])
-        stds = np.array([effect.ln_std for effect in self.effects])
+        medians, stds = self.ln_medians, self.ln_stds
 
         # In standard deviations of the hyperprior, because these differ by a factor of 65.
         def cost(scaled: Floats) -> tuple[float, Floats]:
-            value, gradient = self._likelihood(matrices, medians + stds * scaled)
+            value, gradient = self._likelihood(medians + stds * scaled)
             return -value + 0.5 * float(scaled @ scaled), scaled - stds * gradient
 
         begin = np.zeros(len(stds)) if start is None else np.clip((start - medians) / stds, *RANGE)
@@ -91,31 +111,20 @@ class EffectModel:
         found = scipy.optimize.minimize(
             cost, begin, jac=True, method="L-BFGS-B", bounds=[RANGE] * len(stds), options=options
         )
-        mode = np.asarray(medians + stds * found.x, np.float64)
-        inverse = np.linalg.inv(self._covariance(matrices, mode))
-        scaled = 2.0 * np.exp(2.0 * mode)[:, None, None] * (inverse @ matrices)
-        # Half of the traces of the products of each two.
-        products = scaled.reshape(len(mode), -1) @ scaled.transpose(0, 2, 1).reshape(len(mode), -1).T
-        information = np.diag(1.0 / stds**2) + 0.25 * (products + products.T)
-        covariance = np.asarray(np.linalg.inv(information), np.float64)
-        # Laplace: the hyperprior's density is normalised, its constant is in the determinants.
-        evidence = -float(found.fun) + 0.5 * float(np.linalg.slogdet(covariance)[1]) - float(np.log(stds).sum())
-        return Sizes(mode, covariance, evidence)
+        return Sizes(np.asarray(medians + stds * found.x, np.float64), -float(found.fun), self)
 
     def posterior(self, sizes: Sizes) -> Posterior:
         """The unknowns, averaged over the sizes."""
-        matrices = self._matrices()
         columns = np.concatenate([effect.columns for effect in self.effects])
         owner = np.repeat(np.arange(len(self.effects)), [len(effect.columns) for effect in self.effects])
-        medians = np.log([effect.median for effect in self.effects])
-        stds = np.array([effect.ln_std for effect in self.effects])
+        medians, stds = self.ln_medians, self.ln_stds
         normal = _points(len(medians))
         root = np.linalg.cholesky(sizes.covariance)
         points = sizes.mode + normal @ root.T
         points = np.clip(points, medians + RANGE[0] * stds, medians + RANGE[1] * stds)
         ln_weight = np.empty(len(points))
-        for index, point in enumerate(points):
-            factor, solved = self._factorise(matrices, point)
+        factors = [self._factorise(point) for point in points]
+        for index, (point, (factor, solved)) in enumerate(zip(points, factors, strict=True)):
             value = -0.5 * float(self.y @ solved) - float(np.log(np.diag(factor)).sum())
             value -= 0.5 * len(self.y) * np.log(2.0 * np.pi)
             ln_prior = -0.5 * float((((point - medians) / stds) ** 2).sum()) - float(np.log(stds).sum())
@@ -128,10 +137,9 @@ class EffectModel:
         evidence = top + float(np.log(np.exp(ln_weight - top).mean()))
         weight /= weight.sum()
         mean, square = np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
-        for share, point in zip(weight, points, strict=True):
+        for share, point, (factor, solved) in zip(weight, points, factors, strict=True):
             if share < NEGLIGIBLE * weight.max():
                 continue
-            factor, solved = self._factorise(matrices, point)
             variance = np.exp(2.0 * point)[owner]
             effect = variance[:, None] * columns
             one = effect @ solved
@@ -146,7 +154,7 @@ class EffectModel:
 
     def most_probable(self, sizes: Sizes) -> Floats:
         """(unknowns,) at the most probable sizes."""
-        _, solved = self._factorise(self._matrices(), sizes.mode)
+        _, solved = self._factorise(sizes.mode)
         return np.concatenate(
             [
                 np.exp(2.0 * ln_size) * (effect.columns @ solved)
@@ -156,37 +164,45 @@ class EffectModel:
 
     def covariance(self, ln_sizes: Floats) -> Floats:
         """(m, m) of the observations at sizes of the effects."""
-        return self._covariance(self._matrices(), ln_sizes)
+        sum_of_effects = np.exp(2.0 * ln_sizes) @ self.matrices.reshape(len(self.matrices), -1)
+        return np.asarray(self.noise + sum_of_effects.reshape(self.noise.shape))
 
-    def _matrices(self) -> Floats:
+    @cached_property
+    def matrices(self) -> Floats:
         """(effects, m, m) what each effect adds to the covariance at size 1."""
         return np.stack([effect.matrix for effect in self.effects])
 
-    def _covariance(self, matrices: Floats, ln_sizes: Floats) -> Floats:
-        sum_of_effects = np.exp(2.0 * ln_sizes) @ matrices.reshape(len(matrices), -1)
-        return np.asarray(self.noise + sum_of_effects.reshape(self.noise.shape))
+    @property
+    def ln_medians(self) -> Floats:
+        """(effects,) of the sizes."""
+        return np.log([effect.median for effect in self.effects])
 
-    def _factorise(self, matrices: Floats, ln_sizes: Floats) -> tuple[Floats, Floats]:
+    @property
+    def ln_stds(self) -> Floats:
+        """(effects,) of ln sizes."""
+        return np.array([effect.ln_std for effect in self.effects])
+
+    def _factorise(self, ln_sizes: Floats) -> tuple[Floats, Floats]:
         """Cholesky factor (m, m) of the covariance, and the covariance's inverse times y.
 
         LAPACK's routines are called as they are: the checks of scipy.linalg take as long as a factor of 100 x 100.
         """
-        factor, failed = scipy.linalg.lapack.dpotrf(self._covariance(matrices, ln_sizes), lower=1, clean=1)
+        factor, failed = scipy.linalg.lapack.dpotrf(self.covariance(ln_sizes), lower=1, clean=1)
         if failed:
             raise np.linalg.LinAlgError(f"the covariance of the observations is not positive definite ({failed})")
         return factor, scipy.linalg.lapack.dpotrs(factor, self.y, lower=1)[0]
 
-    def _likelihood(self, matrices: Floats, ln_sizes: Floats) -> tuple[float, Floats]:
+    def _likelihood(self, ln_sizes: Floats) -> tuple[float, Floats]:
         """Ln N(y; 0, C) and its gradient (effects,) by ln size."""
-        factor, solved = self._factorise(matrices, ln_sizes)
-        lower, _ = scipy.linalg.lapack.dpotri(factor, lower=1)
-        # Of the symmetric inverse one triangle is computed; all that follows is a sum over both.
-        inverse = 2.0 * np.tril(lower, -1) + np.diag(np.diag(lower))
+        factor, solved = self._factorise(ln_sizes)
         value = -0.5 * float(self.y @ solved) - float(np.log(np.diag(factor)).sum())
+        # Of the symmetric inverse one triangle is computed, the other is zero; all that follows is a sum over both.
+        inverse, _ = scipy.linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)
+        inverse *= 2.0
+        np.einsum("ii->i", inverse)[:] *= 0.5
         # s^2 (u^T G u - trace(C^-1 G)) with u = C^-1 y, of all effects at once.
-        gradient = np.exp(2.0 * ln_sizes) * (
-            matrices.reshape(len(matrices), -1) @ (np.outer(solved, solved) - inverse).ravel()
-        )
+        both = np.multiply.outer(solved, solved) - inverse.T  # in the order of the matrices in memory
+        gradient = np.exp(2.0 * ln_sizes) * (self.matrices.reshape(len(self.matrices), -1) @ both.ravel())
         return value - 0.5 * len(self.y) * np.log(2.0 * np.pi), gradient
 
 

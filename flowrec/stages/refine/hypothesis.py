@@ -366,25 +366,27 @@ def _evidence(
 ) -> EffectModel:
     """The observations, averaged, and the effects on them."""
     here = observed.operator
-    average = averages(robust, here)
     model = observed.model
     drawn = model.base + nonlinear
     if observed.wall_mode is not None:  # its unknown counts from walls without a bias
         drawn = drawn - model.chip.wall_offset_px * observed.wall_mode
     misfit = observed.misfit(drawn, in_use)
     noise = np.repeat(robust.factor**2 * robust.variance / robust.inlier, 2)
-    effects = [
-        replace(
-            effect,
-            columns=effect.columns @ average.T,
-            kernel=None if effect.kernel is None else average @ effect.kernel @ average.T,
-        )
-        for effect in observed.effects(in_use, line_hz)
-    ]
-    stated = (average * noise) @ average.T
-    effects.append(Effect(*NOISE, np.zeros((0, len(average))), stated))
+    effects, stated, y = observed.effects(in_use, line_hz), np.diag(noise), misfit.ravel()
+    if here.count > MOST_OBSERVATIONS:
+        average = averages(robust, here)
+        effects = [
+            replace(
+                effect,
+                columns=effect.columns @ average.T,
+                kernel=None if effect.kernel is None else average @ effect.kernel @ average.T,
+            )
+            for effect in effects
+        ]
+        stated, y = (average * noise) @ average.T, average @ y
+    effects.append(Effect(*NOISE, np.zeros((0, len(y))), stated))
     least = 1e-9 * float(np.trace(stated)) / len(stated)
-    return EffectModel(average @ misfit.ravel(), least * np.eye(len(stated)), effects)
+    return EffectModel(y, least * np.eye(len(stated)), effects)
 
 
 def groups(count: int) -> NDArray[np.intp]:

@@ -53,9 +53,7 @@ class ObservationOperator:
 
     def on_fluid(self, mask: NDArray[np.bool_]) -> ObservationOperator:
         """The operator on the fluid pixels of a mask (h, w) in raster order."""
-        number = np.full(mask.shape, -1, np.intp)
-        number[mask] = np.arange(np.count_nonzero(mask))
-        return self.renumber(number)
+        return self.renumber(_fluid_number(mask))
 
     def distinct(self) -> ObservationOperator:
         """The operator without copies: an observation that was given several times counts once."""
@@ -76,6 +74,21 @@ class ObservationOperator:
         """The operator in a field with the walls of a raster (h, w), see FlowField."""
         pixels, weights = _stencils(self.points, wall_px.shape, wall_px)
         return replace(self, pixels=pixels, weights=weights)
+
+    def beside(
+        self, steps: Floats, wall_px: NDArray[np.float32], mask: NDArray[np.bool_]
+    ) -> tuple[ObservationOperator, ...]:
+        """The operators whose points are moved by steps (k, 2), and no farther than to the border of the image.
+
+        In a field with the walls of a raster (h, w), on the fluid pixels of a mask.
+        """
+        points = np.clip(self.points + steps[:, None], 0.0, np.array(mask.shape[::-1]) - 1.0)
+        both = (np.split(each, len(steps)) for each in _stencils(points.reshape(-1, 2), wall_px.shape, wall_px))
+        number = _fluid_number(mask)
+        return tuple(
+            replace(self, points=at, pixels=pixels, weights=weights).renumber(number)
+            for at, pixels, weights in zip(points, *both, strict=True)
+        )
 
     def misfit(self, velocity: NDArray[np.floating]) -> Floats:
         """(n,) squared distance of the prediction of a field (h, w, 2), in standard deviations.
@@ -127,6 +140,13 @@ def observation_operator(
         None if observations.time_s is None else observations.time_s[usable],
         None if observations.radius_um is None else observations.radius_um / um_per_px,
     )
+
+
+def _fluid_number(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """(h, w) number of each fluid pixel in raster order, -1 in solid."""
+    number = np.full(mask.shape, -1, np.intp)
+    number[mask] = np.arange(np.count_nonzero(mask))
+    return number
 
 
 def _stencils(

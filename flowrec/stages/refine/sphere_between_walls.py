@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from flowrec.core import Floats
 
+_MOST_PAIRS = 2_000_000  # of a point and a disc that are compared at once, for the memory that they take
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereBetweenWalls:
@@ -40,18 +42,17 @@ class SphereBetweenWalls:
         Rueegsegger (1997). `clearance_px` (h, w) is the distance of pixels to the nearest wall.
         """
         radii = np.where(mask, np.maximum(clearance_px, 0.5), 0.0)
-        square, reach = radii**2, int(np.ceil(radii.max(initial=0.0)))
-        width = []
-        for x, y in points:
-            # No disc whose centre is farther away holds the point.
-            rows = slice(max(int(y) - reach, 0), int(y) + reach + 2)
-            columns = slice(max(int(x) - reach, 0), int(x) + reach + 2)
-            inside = square[rows, columns]
-            away_y = (np.arange(rows.start, rows.start + inside.shape[0]) - y) ** 2
-            away_x = (np.arange(columns.start, columns.start + inside.shape[1]) - x) ** 2
-            width.append(2.0 * radii[rows, columns][away_y[:, None] + away_x <= inside].max(initial=0.5))
+        reach = int(np.ceil(radii.max(initial=0.0)))  # no disc whose centre is farther away holds a point
+        around, window = np.pad(radii, reach + 1), np.arange(-reach, reach + 2)
+        widths = []
+        for part in np.array_split(points, 1 + len(points) * len(window) ** 2 // _MOST_PAIRS):
+            corner = part.astype(np.intp)
+            rows, columns = (corner[:, axis, None] + window for axis in (1, 0))
+            discs = around[(rows + reach + 1)[:, :, None], (columns + reach + 1)[:, None, :]]
+            away = ((rows - part[:, 1:]) ** 2)[:, :, None] + ((columns - part[:, :1]) ** 2)[:, None, :]
+            widths.append(2.0 * np.where(away <= discs**2, discs, 0.25).max(axis=(1, 2)))
         near = np.maximum(near, radius_px)
-        return cls(radius_px, near, np.maximum(np.array(width) - near, near))
+        return cls(radius_px, near, np.maximum(np.concatenate(widths) - near, near))
 
     @property
     def drag(self) -> Floats:

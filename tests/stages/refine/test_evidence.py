@@ -95,3 +95,17 @@ def test_the_sizes_are_the_most_probable_ones(seed):
     best = minimize(lambda ln_sizes: -ln_density(ln_sizes), mode, method="Nelder-Mead").x
     assert mode == pytest.approx(best, abs=0.05)
     assert np.all(np.abs(mode - np.log([0.3, 0.3])) > 0.3), "the hyperpriors are off"
+
+
+def test_the_sizes_are_known_as_well_as_the_expected_information_says():
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(30, 30))
+    few = Effect("few", 0.7, 0.5, rng.normal(size=(3, 30)))
+    both = Effect("both", 0.2, 0.8, rng.normal(size=(2, 30)), 0.1 * root @ root.T)
+    evidence = EffectModel(rng.normal(size=30), 0.3 * np.eye(30), [few, both])
+    sizes = evidence.sizes()
+    inverse = np.linalg.inv(evidence.covariance(sizes.mode))
+    slopes = [2.0 * np.exp(2.0 * size) * one.matrix for size, one in zip(sizes.mode, (few, both), strict=True)]
+    # Half of the trace of C^-1 dC C^-1 dC', of a normal distribution with zero mean, and the hyperprior's precision.
+    information = [[0.5 * np.trace(inverse @ one @ inverse @ other) for other in slopes] for one in slopes]
+    np.testing.assert_allclose(sizes.covariance, np.linalg.inv(information + np.diag([0.5**-2, 0.8**-2])), rtol=1e-9)
