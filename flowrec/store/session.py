@@ -231,7 +231,7 @@ class Session:
     def _tables(self, fields: Sequence[str]) -> Tables:
         from flowrec.store.tables import Tables
 
-        return Tables(self.header.start_unix_ns, self.reader.topics, self.reader.coils_of(fields))
+        return Tables(self.header.taken_unix_ns, self.reader.topics, self.reader.coils_of(fields))
 
     @cached_property
     def frames(self) -> Frames:

@@ -19,7 +19,7 @@ from flowrec.verbs.command import verb
 from flowrec.verbs.options import SessionFile
 
 if TYPE_CHECKING:
-    from flowrec.store import Column, Part
+    from flowrec.store import Column, Part, Session
 
 
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part

@@ -197,8 +197,8 @@ class _Views:
         """
         width = self.camera_share
         if not self.tells_flow:
-            beside = existing([tabs(*_plots(self)), self.lanes(), self.texts()])
-            return rrb.Horizontal(camera, rrb.Vertical(*beside), column_shares=[1.0 - _SMALL, _SMALL])
+            texts = rrb.Vertical(*existing([tabs(*_plots(self)), self.lanes(), self.texts()]))
+            return rrb.Horizontal(camera, texts, column_shares=[1.0 - _SMALL, _SMALL])
         above: Shown = camera
         if beside := tabs(*maps):
             above = rrb.Horizontal(camera, beside, column_shares=[width, 1.0 - width])

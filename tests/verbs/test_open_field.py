@@ -108,3 +108,18 @@ def test_a_flow_that_a_refinement_found_in_an_open_field_is_told_of(dish: Sessio
     assert not tells_flow(dish.chip, last)
     assert tells_flow(dish.chip, replace(last, refined=replace(last.refined, refused="")))
     assert not tells_flow(dish.chip, Tick())
+
+
+def test_a_movie_that_does_not_state_when_it_was_taken_has_no_time_of_day_in_tables(dish: Session) -> None:
+    pytest.importorskip("pyarrow")
+    assert dish.provenance["wall_time"][:2] == "20", "that of the import"
+    assert dish.table("track")["wall_time"].null_count == len(dish.table("track"))
+    assert np.isnat(dish.frames.wall_times).all()
+
+
+def test_an_exported_movie_states_when_its_images_were_taken(dish: Session) -> None:
+    began = {"source_started": "2026-05-04T10:00:00+00:00", "source_first_image_s": "2.500000000"}
+    known = replace(dish.header, provenance={**dish.header.provenance, **began})
+    assert np.datetime64(known.taken_unix_ns, "ns") == np.datetime64("2026-05-04T10:00:02.5")
+    recorded = Session(Path("sessions/golden_moderate.mcap")).header
+    assert recorded.taken_unix_ns == recorded.start_unix_ns > 0
