@@ -97,7 +97,8 @@ class TickLogger:
 
     def log(self, tick: Tick, frame_index: int | None = None) -> None:
         """Log what is new since the previous tick; `frame_index` is for a tick without its frame."""
-        self._last, self._tick = self._tick, tick
+        self._last, self._tick = self._tick, tick.at_images(self._tick)
+        tick = self._tick
         self._entities.set_time(tick.stamp_ns, tick.frame.index if tick.frame is not None else frame_index)
         if tick.refined is not self._last.refined or tick.shift is not self._last.shift:
             # The image moves as the registration that a refinement found, and the shift of a shaking stage, say.

@@ -123,3 +123,33 @@ def test_an_exported_movie_states_when_its_images_were_taken(dish: Session) -> N
     assert np.datetime64(known.taken_unix_ns, "ns") == np.datetime64("2026-05-04T10:00:02.5")
     recorded = Session(Path("sessions/golden_moderate.mcap")).header
     assert recorded.taken_unix_ns == recorded.start_unix_ns > 0
+
+
+def test_what_is_said_of_a_movie_ends_with_its_last_image(dish: Session) -> None:
+    film_s = (IMAGES - 1) / RATE_HZ
+    assert dish.run.last_ns > (film_s + 0.4) * 1e9, "ticks without images, in which the refinement is adopted"
+    assert dish.duration_s == pytest.approx(film_s)
+    assert flowrec.info(dish)["duration_s"] == pytest.approx(film_s)
+    assert dish.outcome["duration_s"] == pytest.approx(film_s)
+
+
+def test_view_and_report_of_a_movie_do_not_lose_the_robot_after_the_last_image(dish: Session) -> None:
+    import rerun as rr
+
+    logger = TickLogger(rr.RecordingStream("test"), scene_of(dish.config, dish.chip, dish.path))
+    for tick in dish.ticks():
+        logger.log(tick)
+    assert entities.PHASE in logger.present
+    assert not logger.present & {entities.SIGHT, entities.MARKS}
+    assert max(logger.states.phases.values()) <= dish.frames.stamps_ns[-1], "the outcome, too"
+    pytest.importorskip("matplotlib")
+    from flowrec.exports.report.history import History
+
+    history = History.of(dish)
+    assert not history.unseen.spans
+    assert history.last_s == pytest.approx((IMAGES - 1) / RATE_HZ)
+    assert history.last.refined is not None
+
+
+def test_an_import_replays_identically(dish: Session) -> None:
+    assert flowrec.replay(dish, verify=True).same
