@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from flowrec.core.errors import ChipError, FlowrecError, UsageError
 from flowrec.core.system.outputs import OutputError
+from flowrec.measure import outline
 from flowrec.measure.calibrate_chip import calibrate_chip
 from flowrec.physics.chip.chip import ChipSettings
 from flowrec.physics.chip.io import load_chip
@@ -109,3 +110,19 @@ def test_a_refused_picture_leaves_no_file(image, tmp_path):
         with pytest.raises(error, match=why):
             calibrate_chip(bad, out, 5.0, **words)
     assert [path.name for path in tmp_path.iterdir()] == ["blank.png"]
+
+
+@pytest.mark.parametrize("count", [100, 32_767, 70_000])
+def test_walls_of_any_length_are_read_from_the_picture(count):
+    ramp = np.tile(np.arange(200, dtype=np.float32), (200, 1))
+    x = np.linspace(0.0, 150.0, count)
+    points = np.column_stack([x, np.full(count, 20.0)])
+    assert np.allclose(outline._at(ramp, points), x + outline._PAD_PX, atol=0.02)
+
+
+@pytest.mark.slow("a picture with walls of more than 32767 px in all, which OpenCV does not take at once")
+def test_a_picture_of_stripes_is_refused_in_a_line(tmp_path):
+    y, x = np.mgrid[:800, :800]
+    cv2.imwrite(str(tmp_path / "stripes.png"), ((x + y) % 64 * 4).astype(np.uint8))
+    with pytest.raises(ChipError):
+        calibrate_chip(tmp_path / "stripes.png", None, 5.0)
