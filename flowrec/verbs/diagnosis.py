@@ -57,6 +57,7 @@ _HEADROOM = 2.0  # of the disk's speed over the rate of a run
 _LEAST_MINUTES = 10.0
 _SILENT_S = 0.3  # longer than lab.guardian_s
 _OLD_DAYS = 90.0
+_SEES_ALL = 1.02  # of a side of the view: a chip that is larger is not seen whole
 # By how much the encodings compress the images of a camera at least; frame_encodings.py has the measurements.
 _PACKED = {"raw": 1.0, "zstd": 1.3, "delta": 1.8, "png": 1.8, "jpeg": 6.0}
 _CAUSES = {
@@ -117,6 +118,7 @@ def _rows(asked: Config, config_file: Path | None, folder: Path | None, wrong: s
     if settled is not None:
         config, chip = settled
         if chip is not None:
+            yield from _view(config, chip)
             yield from _look("mission", _mission, config, chip)
             if config.recording.admission_s:
                 yield from _look("kernels", _kernels, config)
@@ -124,8 +126,8 @@ def _rows(asked: Config, config_file: Path | None, folder: Path | None, wrong: s
             yield from _look("camera", _camera, config, chip)
             yield from _look("coils", _coils, config)
         else:
-            text = f"rig = {asked.rig!r}: neither camera nor coils are looked at; give the configuration of the lab"
-            yield "devices", WARNING, f"{text}, with rig = 'lab'"
+            text = f"rig = {asked.rig!r}: neither camera nor coils are looked at"
+            yield "devices", WARNING, f"{text}; give the configuration of a lab, which flowrec init lab writes"
         yield from _look("disk", _disk, config, folder or Path())
     yield from _calibrations(asked, config_file)
     yield _viewer()
@@ -161,6 +163,19 @@ def _settings(asked: Config) -> Generator[_Row, None, tuple[ResolvedConfig, Chip
         f"Hz, {camera.um_per_px:.4g} um per pixel; robot of radius {config.robot.radius_um:g} um",
     )
     return config, chip
+
+
+def _view(config: ResolvedConfig, chip: Chip) -> Iterator[_Row]:
+    """Whether the camera sees as much as the chip has, of which it may be meant to see a part only."""
+    shown = np.array([config.camera.width_px, config.camera.height_px]) * config.camera.um_per_px
+    of_chip = np.array(chip.size_um)
+    if (np.sort(of_chip) > _SEES_ALL * np.sort(shown)).any():
+        sizes = [" x ".join(f"{1e-3 * side:.3g}" for side in each) for each in (shown, of_chip)]
+        text = f"shows {sizes[0]} mm of a chip of {sizes[1]} mm"
+        needs = (
+            "" if config.mission.observes else "; a mission that leads beyond it loses the robot: lower magnification"
+        )
+        yield "view", WARNING if needs else OK, text + needs
 
 
 def _mission(config: ResolvedConfig, chip: Chip) -> _Rows:
