@@ -286,7 +286,7 @@ def _candidates(p: Pipeline, frame: Frame, sight: Sight) -> tuple[Floats, str]:
     view = View(frame.image, walls, radius_px, -p.tracker.wall_error_radii * radius_px)
     if sight.appearance is None or sight.track is None or not sight.track.seen:
         found = bodies_that_stand_out(view)
-        what = "no image shows a dark disc or one bright spot; {} bodies stand out in image {}"
+        what = "{} bodies stand out in image {}, none of them clearly the robot"
     else:
         x, y = calibration.to_px(sight.track.position_um).tolist()
         found, what = bodies_like(view, (x, y), sight.appearance), "{} bodies in image {} look like the robot"

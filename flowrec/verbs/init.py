@@ -171,7 +171,9 @@ def init(
             }  # nothing else knows
         config = load_config(None, settled, _FLAGS)
         width_px, height_px = subject.size_px
-        refuse_unseen(replace(config, rig=str(LAB), camera=replace(config.camera, width_px=width_px, height_px=height_px)))
+        refuse_unseen(
+            replace(config, rig=str(LAB), camera=replace(config.camera, width_px=width_px, height_px=height_px))
+        )
         if lab and not config.mission.observes:
             _try_amplifier(config)
         if no_chip:

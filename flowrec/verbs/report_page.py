@@ -78,6 +78,7 @@ _HIDDEN = frozenset(  # of the outcome: shown elsewhere
         "wall_ns",
         "monotonic_ns",
         "clocks",
+        "not_refined",
         "recovered_from",
         "frames_windows",
     }

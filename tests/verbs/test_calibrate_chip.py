@@ -126,3 +126,16 @@ def test_a_picture_of_stripes_is_refused_in_a_line(tmp_path):
     cv2.imwrite(str(tmp_path / "stripes.png"), ((x + y) % 64 * 4).astype(np.uint8))
     with pytest.raises(ChipError):
         calibrate_chip(tmp_path / "stripes.png", None, 5.0)
+
+
+def test_a_mask_that_would_replace_the_picture_is_refused_with_a_name_that_does_not(image, tmp_path):
+    mine = tmp_path / "mine.png"
+    mine.write_bytes(image.read_bytes())
+    with pytest.raises(OutputError, match=r"the mask of .*mine\.toml would be written to it; .* -o .*mine_chip\.toml$"):
+        calibrate_chip(mine, tmp_path / "mine.toml", 5.0)
+
+
+def test_the_table_of_a_chip_says_how_large_it_is_so_that_a_wrong_unit_is_seen(image, capsys):
+    calibrate_chip(image, None, 0.005).show()
+    width, height = (0.005 * side for side in reversed(cv2.imread(str(image)).shape[:2]))
+    assert f"({width:.4g} um x {height:.4g} um in all)" in " ".join(capsys.readouterr().out.split())

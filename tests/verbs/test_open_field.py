@@ -153,3 +153,8 @@ def test_view_and_report_of_a_movie_do_not_lose_the_robot_after_the_last_image(d
 
 def test_an_import_replays_identically(dish: Session) -> None:
     assert flowrec.replay(dish, verify=True).same
+
+
+def test_a_dish_is_no_doubtful_flow(dish: Session) -> None:
+    assert "not_refined" not in dish.outcome
+    assert not dish.outcome.get("doubts")
