@@ -163,8 +163,8 @@ def calibrate_chip(
     seeds = [_point(text) for text in seed_points]
     if out is not None and out.with_suffix(".png").absolute() == path.absolute():
         raise OutputError(
-            f"{path}: is read by this command, and the mask of {out} would be written to it; choose another name, as in "
-            f"-o {out.with_name(f'{out.stem}_chip{out.suffix}')}"
+            f"{path}: is read by this command, and the mask of {out} would be written to it; choose another name, as "
+            f"in -o {out.with_name(f'{out.stem}_chip{out.suffix}')}"
         )
     outputs = check_outputs(out, (path,), overwrite, (".png", _OVERLAY))
     picture = read_picture(path, channel) if seen is None else seen.picture
