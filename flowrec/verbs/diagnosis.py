@@ -166,7 +166,7 @@ def _settings(asked: Config) -> Generator[_Row, None, tuple[ResolvedConfig, Chip
 
 
 def _view(config: ResolvedConfig, chip: Chip) -> Iterator[_Row]:
-    """Whether the camera sees as much as the chip has, of which it may be meant to see a part only."""
+    """Compare what the camera sees with the chip, of which it may be meant to see a part only."""
     shown = np.array([config.camera.width_px, config.camera.height_px]) * config.camera.um_per_px
     of_chip = np.array(chip.size_um)
     if (np.sort(of_chip) > _SEES_ALL * np.sort(shown)).any():

@@ -318,7 +318,7 @@ def radius_in_image(image: Image, place_px: Floats, about_px: float) -> float:
 
 def _factor(image: Image) -> int:
     """Size of the drawn picture of the bodies over that of the image."""
-    return max(1, round(_SIDE_PX / max(image.shape)))
+    return max(1, round(_SIDE_PX / float(max(image.shape))))
 
 
 def _candidates(p: Pipeline, frame: Frame, sight: Sight) -> tuple[Floats, str]:
