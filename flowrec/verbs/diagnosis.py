@@ -166,16 +166,13 @@ def _settings(asked: Config) -> Generator[_Row, None, tuple[ResolvedConfig, Chip
 
 
 def _view(config: ResolvedConfig, chip: Chip) -> Iterator[_Row]:
-    """Compare what the camera sees with the chip, of which it may be meant to see a part only."""
-    shown = np.array([config.camera.width_px, config.camera.height_px]) * config.camera.um_per_px
-    of_chip = np.array(chip.size_um)
-    if (np.sort(of_chip) > _SEES_ALL * np.sort(shown)).any():
-        sizes = [" x ".join(f"{1e-3 * side:.3g}" for side in each) for each in (shown, of_chip)]
-        text = f"shows {sizes[0]} mm of a chip of {sizes[1]} mm"
-        needs = (
-            "" if config.mission.observes else "; a mission that leads beyond it loses the robot: lower magnification"
-        )
-        yield "view", WARNING if needs else OK, text + needs
+    """Compare what the camera sees with the chip, of which a mission that observes may see a part."""
+    seen_um = config.camera.um_per_px * np.array([config.camera.width_px, config.camera.height_px])
+    if (np.sort(chip.size_um) > _SEES_ALL * np.sort(seen_um)).any():
+        view, whole = (" x ".join(f"{1e-3 * side:.3g}" for side in each) for each in (seen_um, chip.size_um))
+        text, observes = f"the image shows {view} mm of a chip of {whole} mm", config.mission.observes
+        beyond = "; beyond it the robot is lost: magnify less"
+        yield "view", OK if observes else WARNING, text + ("" if observes else beyond)
 
 
 def _mission(config: ResolvedConfig, chip: Chip) -> _Rows:

@@ -114,7 +114,7 @@ def _bounds(data: ReportData) -> Box:
 
 
 def _track_bounds(data: ReportData) -> Box:
-    """Left, top, right, bottom of the robot's way, which may be small in a dish, with room for the names of its ends."""
+    """Bounds of the robot's way, which may be small in a dish, with room for the names of its ends."""
     path = data.scene.to_plane(place_on_chip(data.history.last, data.path_um))
     margin = _AROUND_TRACK_RADII * data.scene.length_px(data.scene.robot.radius_um)
     (left, top), (right, bottom) = np.nanmin(path, axis=0) - margin, np.nanmax(path, axis=0) + margin
