@@ -186,7 +186,9 @@ def verdict_lines(figures: Mapping[str, Value], refined: FlowField | None = None
     doubts = [f"doubtful: {doubt}" for doubt in doubts_of(figures)]
     ended, note = end_text({**figures, "note": ""}), str(figures.get("note") or "")
     ended += ", doubtful" if ended and doubts else ""
-    told = [ended, note, *doubts, way_text(figures), flow_text(figures), learned_text(refined)]
+    flow = flow_text(figures)
+    asked = flow or not ended or refined is None or not refined.refused  # else no flow was: an open field
+    told = [ended, note, *doubts, way_text(figures), flow, learned_text(refined) if asked else ""]
     return [with_micro(text[:1].upper() + text[1:]) for text in told if text]
 
 

@@ -84,6 +84,7 @@ class Extra(Mapping[str, Message]):
 
 
 NO_EXTRA = Extra()
+_OF_IMAGES = ("applied", "operator", "track", "estimate", "health", "demand", "currents", "timing", "mapless")
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +129,25 @@ class Tick:
     def field(self) -> FlowField | None:
         """The best flow known: refined where there is one, else assumed."""
         return self.refined if self.refined is not None else self.assumed
+
+    @property
+    def is_afterwards(self) -> bool:
+        """True after the last image, while an observation waits for its refinement."""
+        ended = self.mission is not None and self.mission.input_ended
+        return ended and self.applied is not None and self.applied.without_image
+
+    def at_images(self, last: Tick) -> Tick:
+        """The tick for people, to whom a session ends with its last image: that of `last`, the tick shown before.
+
+        What comes afterwards is shown with that image: maps, mission and events; none of what tells of an image.
+        """
+        if not self.is_afterwards or last.stamp_ns < 0:
+            return self
+        assert self.mission is not None
+        since_ns = min(self.mission.since_ns, last.stamp_ns)
+        kept = {name: getattr(last, name) for name in _OF_IMAGES}
+        mission = self.mission if self.mission is last.mission else dataclasses.replace(self.mission, since_ns=since_ns)
+        return dataclasses.replace(self, stamp_ns=last.stamp_ns, mission=mission, **kept)
 
     def news(self, last: Tick, names: Iterable[str]) -> dict[str, Message]:
         """The messages in these fields that are new since another tick, by field."""

@@ -4,7 +4,7 @@ from .layout import write_layouts as write_layouts
 from .report import style as style
 from .report.curve_figures import (
     MotionFigure as MotionFigure, ObserverFigure as ObserverFigure, PathFlowFigure as PathFlowFigure,
-    RecordingFigure as RecordingFigure,
+    RecordingFigure as RecordingFigure, TrackFigure as TrackFigure,
 )
 from .report.curves import Span as Span
 from .report.explanations import GLOSSARY as GLOSSARY, MEANINGS as MEANINGS, sentence as sentence

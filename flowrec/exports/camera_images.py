@@ -5,14 +5,14 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator
 from dataclasses import asdict
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from flowrec.core import Applied, Frame, Image, SessionError, Tick, printable, seconds, without_none
+from flowrec.core import NS_PER_S, Applied, Frame, Image, SessionError, Tick, printable, seconds, without_none
 from flowrec.exports.formats import TimeProgress
 from flowrec.movies import MovieNotes
 from flowrec.store import Session
@@ -152,7 +152,9 @@ def notes_of(session: Session, first: Frame, grey: GreyScale, *, drawn: bool = F
 
 def start_time(session: Session) -> str:
     """Wall time of the start of the run, ISO 8601 with its zone; '' if the session does not state one."""
-    text = session.provenance.get("wall_time", "")
+    text, taken_ns = session.provenance.get("wall_time", ""), session.header.taken_unix_ns
+    if taken_ns != session.header.start_unix_ns:  # an import, whose own time is not that of the movie
+        return datetime.fromtimestamp(taken_ns / NS_PER_S, UTC).isoformat() if taken_ns else ""
     try:
         time = datetime.fromisoformat(text)
     except ValueError:

@@ -56,7 +56,7 @@ class ZarrExport:
 
 
 def _write_frames(root: zarr.Group, session: Session, progress: TimeProgress) -> None:
-    frames, start_unix_ns = session.frames, session.header.start_unix_ns
+    frames, start_unix_ns = session.frames, session.header.taken_unix_ns
     stamps_ns = frames.stamps_ns
     coordinates: dict[str, tuple[Sequence[str], Any, dict[str, Any]]] = {
         column.name: (["time"], values, {"description": column.meaning, "units": column.unit, "long_name": name})

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, cast, get_args
 import cv2
 import numpy as np
 
-from flowrec.core import ChipError, UsageError, __version__, say, table
+from flowrec.core import ChipError, OutputError, UsageError, __version__, say, table
 from flowrec.measure.images import Colours, Mask, SourcePicture, png_of, read_picture, with_curves
 from flowrec.measure.proposal import check_outputs, write_outputs
 from flowrec.measure.segmentation import Segmentation, Shown, chip_mask, segment
@@ -109,8 +109,11 @@ class PictureChip(NamedTuple):
             for name, o, kind in self.named_openings
         ]
         height, width = self.mask.shape
+        size = ""
+        if self.um_per_px is not None:
+            size = f" ({width * self.pixel_size:.4g} um x {height * self.pixel_size:.4g} um in all)"
         fluid = f"{100 * float(self.mask.mean()):.1f} % fluid"
-        title = f"Channel in {self.picture.source}: mask of {width} x {height} px, {fluid}"
+        title = f"Channel in {self.picture.source}: mask of {width} x {height} px{size}, {fluid}"
         table(title, ("opening", "pixels", f"width ({self.unit})", "kind"), rows)
         say(verdict(self))
         if (out := self.out) is not None:
@@ -158,6 +161,11 @@ def calibrate_chip(
     if wall_shift_um and (um_per_px is None or not math.isfinite(wall_shift_um)):
         raise UsageError(f"--wall-shift {wall_shift_um:g}: it is in um, so give --um-per-px, too")
     seeds = [_point(text) for text in seed_points]
+    if out is not None and out.with_suffix(".png").absolute() == path.absolute():
+        raise OutputError(
+            f"{path}: is read by this command, and the mask of {out} would be written to it; choose another name, as "
+            f"in -o {out.with_name(f'{out.stem}_chip{out.suffix}')}"
+        )
     outputs = check_outputs(out, (path,), overwrite, (".png", _OVERLAY))
     picture = read_picture(path, channel) if seen is None else seen.picture
     try:

@@ -23,6 +23,7 @@ from flowrec.measure.images import Levels, Mask, blur_image, draw_curves, fill_c
 
 Walls = Literal["dark", "bright", "step"]
 _PAD_PX = 24  # by which a channel goes on straight beyond the picture
+_MOST_ROWS = 30_000  # of a map that OpenCV takes at once, which has to have fewer than 32767
 _STEP_PX = 0.5  # between two samples of a profile
 _LEAST_REACH_PX, _MOST_REACH_PX = 3.0, 14.0
 _SEARCH_PX = (3.0, 2.0, 1.5, 1.0, 1.0)  # in each round; not beyond half of the reach
@@ -257,9 +258,12 @@ def _inward(curve: Floats, level: Levels) -> Floats:
 def _at(padded: Levels, points: Floats) -> Floats:
     """Values (...) of a padded image at points (..., 2)."""
     at = np.asarray(points + _PAD_PX, np.float32)
-    flat = at.reshape(len(at), -1, 2)
-    found = cv2.remap(padded, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return found.astype(np.float64).reshape(at.shape[:-1])
+    blocks = np.split(at.reshape(len(at), -1, 2), range(_MOST_ROWS, len(at), _MOST_ROWS))
+    found = [
+        cv2.remap(padded, each[..., 0], each[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for each in blocks
+    ]
+    return np.concatenate(found).astype(np.float64).reshape(at.shape[:-1])
 
 
 def _along(values: Floats, sigma_px: float) -> Floats:

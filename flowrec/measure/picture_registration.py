@@ -82,7 +82,7 @@ def _is_blank(picture: Image) -> bool:
 
 def _shows_walls(picture: Image, chip: Chip) -> bool:
     """False where the picture is small or blank, or the chip, like an open field, has walls along its border only."""
-    return not (_is_small(picture) or _is_blank(picture) or chip.mask[1:-1, 1:-1].all())
+    return not (_is_small(picture) or _is_blank(picture) or chip.is_open_field)
 
 
 def register(

@@ -50,7 +50,7 @@ class RunReport:
     outcome: str = Outcome.TIME_OVER
     note: str = ""
     ticks: int = 0
-    duration_s: float = 0.0
+    duration_s: float = 0.0  # to the last image: without the ticks in which an observation waits for its refinement
     wall_s: float = 0.0
     contacts: int = 0
     passed_over: int = 0  # frames whose stamp did not increase
@@ -197,7 +197,8 @@ def run(
             sinks_ms = watch.ms["sinks"]
             first_ns = tick.stamp_ns if first_ns is None else first_ns
             report.ticks += 1
-            report.duration_s = seconds(tick.stamp_ns - first_ns)
+            if not tick.is_afterwards:
+                report.duration_s = seconds(tick.stamp_ns - first_ns)
             report.contacts = inputs.truth.contacts if inputs.truth is not None else report.contacts
             if report.navigating_ns is None and mission.phase == Phase.NAVIGATE:
                 report.navigating_ns = tick.stamp_ns

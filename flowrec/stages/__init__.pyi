@@ -72,7 +72,7 @@ from .rig_settings import (
 )
 from .run_figures import (
     RunStatistics as RunStatistics, figures_of as figures_of, flow_error as flow_error, length_um as length_um,
-    robot_at as robot_at, shortest_way as shortest_way,
+    robot_at as robot_at, shortest_way as shortest_way, tells_flow as tells_flow,
 )
 from .setting_rows import (
     SettingRow as SettingRow, commented_toml as commented_toml, section_summary as section_summary,

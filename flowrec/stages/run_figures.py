@@ -54,6 +54,11 @@ class RunStatistics:
         return finite(math.sqrt(self._square_um2 / self._count)) if self._count else None
 
 
+def tells_flow(chip: Chip, tick: Tick) -> bool:
+    """False where no flow was asked for, in an open field that nothing drives, and no refinement has found one."""
+    return not chip.is_still or (tick.refined is not None and not tick.refined.refused)
+
+
 def figures_of(
     chip: Chip, last: Tick, true_field: FlowField | None, contacts: int, navigating_ns: int | None
 ) -> Figures:
@@ -77,6 +82,8 @@ def figures_of(
         figures["speed_limit_um_s"] = mission.speed_limit_um_s
     if true_field is not None:
         figures["contacts"] = contacts
+    if not tells_flow(chip, last):
+        return figures
     for name in FLOW_FIELDS:
         flow: FlowField | None = getattr(last, name)
         if flow is not None and (true_field is not None or not flow.refused or flow.log_score is not None):

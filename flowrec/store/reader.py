@@ -268,7 +268,7 @@ class Frames(Sequence[Frame]):
     Attributes
     ----------
     stamps_ns : (n,) stamps on the session clock; no image is read for them.
-    wall_times : (n,) the same as time of day, UTC; NaT where the file does not state when its clock was 0.
+    wall_times : (n,) the same as time of day, UTC; NaT where the file does not state it, see SessionHeader.
     """
 
     def __init__(self, reader: SessionReader, which: range | None = None) -> None:
@@ -281,7 +281,7 @@ class Frames(Sequence[Frame]):
 
     @property
     def wall_times(self) -> NDArray[np.datetime64]:
-        start_unix_ns = self._reader.header.start_unix_ns
+        start_unix_ns = self._reader.header.taken_unix_ns
         times = (self.stamps_ns + start_unix_ns).view("datetime64[ns]")
         return times if start_unix_ns else np.full(len(times), np.datetime64("NaT", "ns"))
 

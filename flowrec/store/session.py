@@ -130,8 +130,10 @@ class Session:
 
     @property
     def duration_s(self) -> float:
-        """From the first tick to the last, in s."""
-        return seconds(self.run.last_ns - self.run.first_ns)
+        """From the first tick to the last, in s; of a movie to that of its last image, which its outcome states."""
+        ticks_s = seconds(self.run.last_ns - self.run.first_ns)
+        stated_s = self.outcome.get("duration_s") if self.setting("rig") == "movie" else None
+        return min(ticks_s, stated_s) if isinstance(stated_s, float) else ticks_s
 
     @cached_property
     def topics(self) -> dict[str, int]:
@@ -231,7 +233,7 @@ class Session:
     def _tables(self, fields: Sequence[str]) -> Tables:
         from flowrec.store.tables import Tables
 
-        return Tables(self.header.start_unix_ns, self.reader.topics, self.reader.coils_of(fields))
+        return Tables(self.header.taken_unix_ns, self.reader.topics, self.reader.coils_of(fields))
 
     @cached_property
     def frames(self) -> Frames:

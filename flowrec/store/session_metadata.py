@@ -9,12 +9,13 @@ import functools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from mcap.records import Attachment, Metadata, Statistics
 
-from flowrec.core import SessionError, __version__
+from flowrec.core import NS_PER_S, SessionError, __version__, nanoseconds, parse_toml
 from flowrec.store.mcap_format import Summary
 from flowrec.store.mcap_reader import ForeignError, McapReader
 
@@ -107,6 +108,27 @@ class SessionHeader:
         from flowrec.physics import chip_from_files
 
         return chip_from_files(self.chip_png, self.chip_toml)
+
+    @property
+    def taken_unix_ns(self) -> int:
+        """Unix time at which stamp 0 of the images was; 0: not known.
+
+        The clock of an import began at the import; only a movie that flowrec exported says when it was taken.
+        """
+        from flowrec.stages import MOVIE
+
+        try:
+            imported = parse_toml(self.config_toml).get("rig") == MOVIE
+        except (ValueError, RecursionError):  # what needs the settings says that they are damaged
+            imported = False
+        if not imported:
+            return self.start_unix_ns
+        try:
+            began = datetime.fromisoformat(self.provenance["source_started"])
+            first_s = float(self.provenance["source_first_image_s"])
+        except (KeyError, ValueError):
+            return 0
+        return round(began.timestamp() * NS_PER_S) + nanoseconds(first_s) if began.tzinfo is not None else 0
 
     def is_same_run(self, other: SessionHeader) -> bool:
         """True if two headers differ in their part at most."""

@@ -41,7 +41,11 @@ STAMP, TIME, WALL = "stamp_ns", "time_s", "wall_time"
 _COMMON = {
     STAMP: ("int64", "stamp of the message on the session clock"),
     TIME: ("float64", "stamp in s, as in Session.at"),
-    WALL: ("timestamp", "time of day of the stamp, UTC; empty in files that do not state when their clock was 0"),
+    WALL: (
+        "timestamp",
+        "time of day of the stamp, UTC; empty in files that do not state when their clock was 0, "
+        "and of a movie that does not state when it was taken",
+    ),
 }
 
 _READ_WITH_PIXELS = ("index", "image")  # of a Frame

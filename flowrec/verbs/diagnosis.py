@@ -57,6 +57,7 @@ _HEADROOM = 2.0  # of the disk's speed over the rate of a run
 _LEAST_MINUTES = 10.0
 _SILENT_S = 0.3  # longer than lab.guardian_s
 _OLD_DAYS = 90.0
+_SEES_ALL = 1.02  # of a side of the view: a chip that is larger is not seen whole
 # By how much the encodings compress the images of a camera at least; frame_encodings.py has the measurements.
 _PACKED = {"raw": 1.0, "zstd": 1.3, "delta": 1.8, "png": 1.8, "jpeg": 6.0}
 _CAUSES = {
@@ -117,6 +118,7 @@ def _rows(asked: Config, config_file: Path | None, folder: Path | None, wrong: s
     if settled is not None:
         config, chip = settled
         if chip is not None:
+            yield from _view(config, chip)
             yield from _look("mission", _mission, config, chip)
             if config.recording.admission_s:
                 yield from _look("kernels", _kernels, config)
@@ -124,8 +126,8 @@ def _rows(asked: Config, config_file: Path | None, folder: Path | None, wrong: s
             yield from _look("camera", _camera, config, chip)
             yield from _look("coils", _coils, config)
         else:
-            text = f"rig = {asked.rig!r}: neither camera nor coils are looked at; give the configuration of the lab"
-            yield "devices", WARNING, f"{text}, with rig = 'lab'"
+            text = f"rig = {asked.rig!r}: neither camera nor coils are looked at"
+            yield "devices", WARNING, f"{text}; give the configuration of a lab, which flowrec init lab writes"
         yield from _look("disk", _disk, config, folder or Path())
     yield from _calibrations(asked, config_file)
     yield _viewer()
@@ -161,6 +163,16 @@ def _settings(asked: Config) -> Generator[_Row, None, tuple[ResolvedConfig, Chip
         f"Hz, {camera.um_per_px:.4g} um per pixel; robot of radius {config.robot.radius_um:g} um",
     )
     return config, chip
+
+
+def _view(config: ResolvedConfig, chip: Chip) -> Iterator[_Row]:
+    """Compare what the camera sees with the chip, of which a mission that observes may see a part."""
+    seen_um = config.camera.um_per_px * np.array([config.camera.width_px, config.camera.height_px])
+    if (np.sort(chip.size_um) > _SEES_ALL * np.sort(seen_um)).any():
+        view, whole = (" x ".join(f"{1e-3 * side:.3g}" for side in each) for each in (seen_um, chip.size_um))
+        text, observes = f"the image shows {view} mm of a chip of {whole} mm", config.mission.observes
+        beyond = "; beyond it the robot is lost: magnify less"
+        yield "view", OK if observes else WARNING, text + ("" if observes else beyond)
 
 
 def _mission(config: ResolvedConfig, chip: Chip) -> _Rows:

@@ -32,6 +32,7 @@ from flowrec.core import (
     say,
     seconds,
     shift_px,
+    warn,
 )
 from flowrec.rigs import MovieSource
 from flowrec.stages import (
@@ -52,6 +53,8 @@ from flowrec.verbs.preparation import Prepared, prepare
 
 _SHAKES_PX = 0.1  # root mean square from which on it is told; half a pixel is what a track is off at most
 _PX = "px"
+_SURROUNDINGS_RADII = 6.0  # of the robot as stated: half the side of the window in which its size is measured
+_OTHER_SIZE = 2.0  # factor from which on a size is another one
 _SIDE_PX = 1200  # of the picture of candidates, about
 _AMBER, _BLACK = (38, 140, 255), (0, 0, 0)  # blue, green, red
 
@@ -253,28 +256,69 @@ def _with_chosen_body(asked: Config, p: Pipeline, image: Frame, sight: Sight, ro
     places, what = _candidates(p, image, sight)
     name = asked.movie.path
     if not len(places) or (len(places) == 1 and not robot and sight.appearance is not None):
+        if len(places) and (size := _size_text(p, image.image, places[0])):
+            warn(f"{name}: the robot in image {image.index} has {size}")
         return asked
     if robot:
         number = int(robot)
         if not 1 <= number <= len(places):
             there = "is 1" if len(places) == 1 else f"are {len(places)}"
             raise UsageError(f"--robot {robot}: there {there} to choose from in image {image.index} of {name}")
+        if size := _size_text(p, image.image, places[number - 1]):
+            warn(f"{name}: body {number} of image {image.index} has {size}")
         x, y = places[number - 1].round(2).tolist()
         return replace(asked, tracker=replace(asked.tracker, click_px=(x, y), click_frame=image.index))
     count = f"at least {len(places)}" if len(places) >= MOST - 4 else len(places)  # near the limit some are left out
-    factor = _factor(image.image)
+    factor, told = _factor(image.image), what.format(count, image.index)
+    if len(places) == 1:
+        size = _size_text(p, image.image, places[0])
+        told = f"one body stands out in image {image.index}, not clearly the robot{size and f'; it has {size}'}"
     picture = write_picture(_draw_numbers(image.image, places, p), folder / f"{Path(name).stem}_robots{PICTURE[0]}")
     enlarged = f", {factor} times as large," if factor > 1 else ""
     raise UsageError(
-        f"{name}: {what.format(count, image.index)}; {picture} shows them{enlarged} with numbers from the top down: "
+        f"{name}: {told}; {picture} shows them{enlarged} with numbers from the top down: "
         "say which one is the robot with --robot N, or by its place: --robot X,Ypx in pixels of the movie, --robot "
         "X,Y in um"
     )
 
 
+def _size_text(p: Pipeline, image: Image, place_px: Floats) -> str:
+    """Size of a body in the image, where it is far from that which is stated for the robot; else ''."""
+    stated_um = p.robot.radius_um
+    measured_um = radius_in_image(image, place_px, stated_um / p.calibration.um_per_px) * p.calibration.um_per_px
+    if not measured_um or 1.0 / _OTHER_SIZE < measured_um / stated_um < _OTHER_SIZE:
+        return ""
+    return f"a radius of about {measured_um:.3g} um, where robot.radius_um = {stated_um:g}: correct that, or the scale"
+
+
+def radius_in_image(image: Image, place_px: Floats, about_px: float) -> float:
+    """Radius in px of a disc as large as the body at a place (2,); 0 where its outline is not seen.
+
+    The body is what differs from its surroundings by half as much as the most at that place does, with its holes.
+    """
+    reach, (x, y) = math.ceil(_SURROUNDINGS_RADII * max(about_px, 2.0)), (round(each) for each in place_px.tolist())
+    left, top = max(x - reach, 0), max(y - reach, 0)
+    window = image[top : y + reach + 1, left : x + reach + 1].astype(np.float32)
+    off = np.abs(window - np.median(window))
+    near = np.hypot(*np.ogrid[top - y : top - y + len(window), left - x : left - x + window.shape[1]]) <= max(
+        about_px, 2.0
+    )
+    body = (off > 0.5 * np.quantile(off[near], 0.95)).astype(np.uint8)
+    outlines, _ = cv2.findContours(body, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    distances = [abs(min(cv2.pointPolygonTest(each, (x - left, y - top), measureDist=True), 0.0)) for each in outlines]
+    if not distances or min(distances) > about_px:
+        return 0.0
+    outline = outlines[int(np.argmin(distances))]
+    width, height = window.shape[::-1]
+    if (outline[:, 0].min(axis=0) == 0).any() or (outline[:, 0].max(axis=0) == (width - 1, height - 1)).any():
+        return 0.0  # it goes on beyond the window
+    filled = cv2.drawContours(np.zeros_like(body), [outline], 0, 1, cv2.FILLED)
+    return math.sqrt(float(filled.sum()) / math.pi)
+
+
 def _factor(image: Image) -> int:
     """Size of the drawn picture of the bodies over that of the image."""
-    return max(1, round(_SIDE_PX / max(image.shape)))
+    return max(1, round(_SIDE_PX / float(max(image.shape))))
 
 
 def _candidates(p: Pipeline, frame: Frame, sight: Sight) -> tuple[Floats, str]:
@@ -286,7 +330,7 @@ def _candidates(p: Pipeline, frame: Frame, sight: Sight) -> tuple[Floats, str]:
     view = View(frame.image, walls, radius_px, -p.tracker.wall_error_radii * radius_px)
     if sight.appearance is None or sight.track is None or not sight.track.seen:
         found = bodies_that_stand_out(view)
-        what = "no image shows a dark disc or one bright spot; {} bodies stand out in image {}"
+        what = "{} bodies stand out in image {}, none of them clearly the robot"
     else:
         x, y = calibration.to_px(sight.track.position_um).tolist()
         found, what = bodies_like(view, (x, y), sight.appearance), "{} bodies in image {} look like the robot"

@@ -78,7 +78,7 @@ def import_movie(
     ------
     FlowrecError : in one line: what can not be read, what does not fit together, what is not told.
     """
-    from flowrec.core import MCAP, Output, settings_of
+    from flowrec.core import MCAP, Output, say, settings_of
 
     given = {} if fps is None else {"movie.rate_hz": fps}
     flags = dict.fromkeys(given, "--fps")
@@ -87,6 +87,8 @@ def import_movie(
     from flowrec.verbs.mission_run import run_mission
 
     asked = asked_import(movie, chosen, coils=coils, times=times, fps=fps, partial=partial)
+    if not asked.movie.coils and not asked.movie.drifts:
+        say(f"{movie}: without --coils LOG the robot is tracked, and the flow is not refined")
     path = None if out is None else Path(out)
     if path is not None:  # before the whole movie is looked through
         Output(path, MCAP, (*inputs,), overwrite).check()

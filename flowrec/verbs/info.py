@@ -7,18 +7,19 @@ long.
 import json
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flowrec.core import name_of, of_text, outside_facts, seconds, text_of_figure
+from flowrec.core import ChipError, name_of, of_text, outside_facts, seconds, text_of_figure
 from flowrec.verbs.command import verb
 from flowrec.verbs.options import SessionFile
 
 if TYPE_CHECKING:
-    from flowrec.store import Column, Part
+    from flowrec.store import Column, Part, Session
 
 
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
@@ -29,6 +30,7 @@ _OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance
 # Shown with another fact, or not at all.
 _WITHIN_OTHERS = ("note", "parts", "commit", "local_changes", "chip_width_um", "chip_height_um", "chip_openings")
 _NOT_SHOWN = ("duration", "wall_ns", "monotonic_ns")
+_DRIVES = ("speed_um_s", "pressure_pa")  # of an opening
 _STAGES = ("observer", "refine", "plan", "control")
 
 
@@ -85,7 +87,7 @@ def info(
     ------
     SessionError : there is no session.
     """
-    from flowrec.store import Session, toml_table
+    from flowrec.store import Session
 
     session = Session.of(session)
     path, run, header = session.path, session.run, session.header
@@ -97,7 +99,7 @@ def info(
         "duration_s": session.duration_s,
         "size_bytes": sum(file.size_bytes for file in run.files),
         "parts": len(run.files) if run.in_parts else None,
-        **_chip(toml_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
+        **_chip(session),
         "rig": _name(session.setting("rig")),
         "phases": [str(phase) for phase in phases] if isinstance(phases, list) else [],
         **{stage: _name(session.setting(stage, "method")) for stage in _STAGES},
@@ -141,7 +143,9 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         "outcome": facts["outcome"] + _in_brackets(facts["note"]),
         "size_bytes": text_of_figure("size_bytes", facts["size_bytes"])
         + (f" in {facts['parts']} parts" if facts["parts"] else ""),
-        "chip": f"{facts['chip']}{size}, {facts['chip_openings']} openings",
+        "chip": f"none (open field){size}"
+        if facts["chip_openings"] is None
+        else f"{facts['chip']}{size}, {facts['chip_openings']} openings",
         "recorded": facts["recorded"][:19].replace("T", " "),
         "phases": " -> ".join(facts["phases"]) or "?",
         "observer": ", ".join(facts[stage] for stage in _STAGES),
@@ -169,14 +173,25 @@ def _piece(part: "Part", path: Path) -> str:
     return text if part.keyframe_ns is None else f"{text}, goes on from {seconds(part.keyframe_ns):.2f} s"
 
 
-def _chip(table: Mapping[str, Any], png: bytes) -> dict[str, Any]:
+def _chip(session: "Session") -> dict[str, Any]:
+    """Name, size and number of openings, which is None where nobody asked for a flow, see Chip.is_still."""
+    from flowrec.store import toml_table
+
+    header = session.header
+    table, png = toml_table(header.chip_toml, f"{session.path}: chip.toml inside"), header.chip_png
     facts: dict[str, Any] = {"chip": str(table.get("name", "?"))}
     scale_um = table.get("um_per_px")
     if isinstance(scale_um, float) and len(png) >= _PNG_SIZE_AT + _PNG_SIZE.size:
         width_px, height_px = _PNG_SIZE.unpack_from(png, _PNG_SIZE_AT)
         facts |= {"chip_width_um": width_px * scale_um, "chip_height_um": height_px * scale_um}
     openings = table.get("opening")
-    return facts | {"chip_openings": len(openings) if isinstance(openings, list) else 0}
+    if not isinstance(openings, list):
+        return facts | {"chip_openings": 0}
+    driven = any(isinstance(each, dict) and any(each.get(key) for key in _DRIVES) for each in openings)
+    # The mask is looked at only where nothing drives a flow; it may be damaged.
+    with suppress(ChipError):
+        return facts | {"chip_openings": len(openings) if driven or not session.chip.is_still else None}
+    return facts | {"chip_openings": len(openings)}
 
 
 def _local_changes(provenance: Mapping[str, str]) -> bool | None:

@@ -1,7 +1,8 @@
 """`flowrec init`: a configuration for a movie or a lab, with the chip in its images; asks for what is missing."""
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -40,6 +41,8 @@ class StartedConfig(NamedTuple):
     chip : its file; None: it is one that was there already.
     coils : log of a movie.
     timed : the movie states the times of its images.
+    picture : the movie, or the image of the camera.
+    still : it is one image alone.
     """
 
     source: Path
@@ -47,6 +50,8 @@ class StartedConfig(NamedTuple):
     chip: Path | None
     coils: Path | None
     timed: bool
+    picture: Path
+    still: bool
 
     def as_json(self) -> dict[str, Any]:
         """For JSON."""
@@ -61,8 +66,13 @@ class StartedConfig(NamedTuple):
         elif chip is not None:
             mask = chip.with_suffix(".png")
             told += f", with the chip {chip}: look at {chip.stem}_overlay.png, correct {mask}"
-        if self.source == LAB:
-            return [told, f"next: flowrec doctor{file}    flowrec record{file}"]
+        if self.picture != self.source:
+            return [
+                f"{told}; {self.picture} is what the camera sees",
+                f"next: flowrec doctor{file}    flowrec record{file}",
+            ]
+        if self.still and chip is not None and chip.suffix != ".png":
+            return [told, f"next: flowrec record{file}  (a simulated mission on this chip)"]
         log = f" --coils {self.coils or 'LOG.csv'}" if self.coils or chip is None or chip.suffix != ".png" else ""
         log += "" if self.timed else " --fps F"
         return [told, f"next: flowrec import {self.source}{file}{log} -o {self.source.stem}.mcap"]
@@ -76,6 +86,7 @@ class _Subject(NamedTuple):
     size_px: tuple[int, int]
     choices: Mapping[str, str] = MappingProxyType({})  # by setting: what there is to choose from
     timed: bool = True
+    still: bool = False
 
 
 @verb(
@@ -144,32 +155,53 @@ def init(
         chip.check()
     lab = source == LAB and not source.exists()
     subject = _lab_subject(given, out.parent, no_chip) if lab else _movie_subject(source, coils, given)
-    inlet = [name for text in inlet or () for name in text.split(",")]
-    of_chip = {} if no_chip or own_chip else {_INLET: inlet, _INLET_SPEED: inlet_speed_um_s}
-    missing = _questions(subject) | {option: _OF_CHIP[option] for option, value in of_chip.items() if not value}
-    seen = _channel_of(subject.picture) if of_chip else None
-    answers = {} if not missing else _answers(missing, seen, subject, out.with_name(f"{source.stem}_openings.png"))
-    settled = subject.sets | {key: value for key, value in answers.items() if key not in _OF_CHIP}
-    if not own_chip:
-        settled["chip.path"] = chip.path.name
-    if no_chip:
-        settled |= {"chip.um_per_px": settled["camera.um_per_px"], "chip.inlet_speed_um_s": 0.0}  # nothing else knows
-    config = load_config(None, settled, _FLAGS)
-    width_px, height_px = subject.size_px
-    refuse_unseen(replace(config, rig=LAB, camera=replace(config.camera, width_px=width_px, height_px=height_px)))
-    if lab and not config.mission.observes:
-        _try_amplifier(config)
-    if no_chip:
-        with chip.new_file() as part:
-            part.write_bytes(open_field(*subject.size_px))
-    elif not own_chip:
-        told: dict[str, Any] = {"inlets": inlet, "inlet_speed_um_s": inlet_speed_um_s}
-        told |= {name: answers[option] for name, option in _ANSWERED.items() if option in answers}
-        calibrate_chip(subject.picture, chip.path, settled["camera.um_per_px"], **told, overwrite=overwrite, seen=seen)
-    head = f"# By flowrec init, for {source.name}. flowrec settings explains what else can be set.\n\n"
-    with output.new_file() as part:
-        part.write_text(head + commented_toml(config, changed_only=True), encoding="utf-8")
-    return StartedConfig(source, out, None if own_chip else chip.path, coils, subject.timed)
+    with _kept_on_success(subject.picture if lab else None):
+        inlet = [name for text in inlet or () for name in text.split(",")]
+        of_chip = {} if no_chip or own_chip else {_INLET: inlet, _INLET_SPEED: inlet_speed_um_s}
+        missing = _questions(subject) | {option: _OF_CHIP[option] for option, value in of_chip.items() if not value}
+        seen = _channel_of(subject.picture) if of_chip else None
+        answers = {} if not missing else _answers(missing, seen, subject, out.with_name(f"{source.stem}_openings.png"))
+        settled = subject.sets | {key: value for key, value in answers.items() if key not in _OF_CHIP}
+        if not own_chip:
+            settled["chip.path"] = chip.path.name
+        if no_chip:
+            settled |= {
+                "chip.um_per_px": settled["camera.um_per_px"],
+                "chip.inlet_speed_um_s": 0.0,
+            }  # nothing else knows
+        config = load_config(None, settled, _FLAGS)
+        width_px, height_px = subject.size_px
+        refuse_unseen(
+            replace(config, rig=str(LAB), camera=replace(config.camera, width_px=width_px, height_px=height_px))
+        )
+        if lab and not config.mission.observes:
+            _try_amplifier(config)
+        if no_chip:
+            with chip.new_file() as part:
+                part.write_bytes(open_field(*subject.size_px))
+        elif not own_chip:
+            told: dict[str, Any] = {"inlets": inlet, "inlet_speed_um_s": inlet_speed_um_s}
+            told |= {name: answers[option] for name, option in _ANSWERED.items() if option in answers}
+            calibrate_chip(
+                subject.picture, chip.path, settled["camera.um_per_px"], **told, overwrite=overwrite, seen=seen
+            )
+        head = f"# By flowrec init, for {source.name}. flowrec settings explains what else can be set.\n\n"
+        with output.new_file() as part:
+            part.write_text(head + commented_toml(config, changed_only=True), encoding="utf-8")
+        return StartedConfig(
+            source, out, None if own_chip else chip.path, coils, subject.timed, subject.picture, still=subject.still
+        )
+
+
+@contextmanager
+def _kept_on_success(picture: Path | None) -> Iterator[None]:
+    """Remove the picture of a camera where no configuration was written that tells of it."""
+    try:
+        yield
+    except BaseException:
+        if picture is not None:
+            picture.unlink(missing_ok=True)
+        raise
 
 
 def _channel_of(picture: Path) -> "PictureChip":
@@ -197,7 +229,9 @@ def _movie_subject(movie: Path, coils: Path | None, given: Mapping[str, Any]) ->
     if coils is not None:  # a log that an import would refuse is refused before anybody is asked
         config = load_config(None, sets, _FLAGS)
         read_coil_log(coils, config.movie.columns, config.coils)
-    return _Subject(sets, movie, (facts.width_px, facts.height_px), timed=facts.times_ns is not None)
+    return _Subject(
+        sets, movie, (facts.width_px, facts.height_px), timed=facts.times_ns is not None, still=facts.frames == 1
+    )
 
 
 def _lab_subject(given: Mapping[str, Any], folder: Path, no_chip: bool) -> _Subject:
@@ -296,12 +330,19 @@ def _reader(key: str) -> Callable[[str], Any]:
 
 
 def _try_amplifier(config: "Config") -> None:
-    """Open the amplifier, which stays at zero, and say what it is and what field the limits permit."""
-    from flowrec.core import say
+    """Open the amplifier, which stays at zero, and say what it is and what field the limits permit.
+
+    One that is not there is told of: the settings of the lab are complete without it.
+    """
+    from flowrec.core import RigError, say, warn
     from flowrec.rigs import probe_amplifier
     from flowrec.verbs.diagnosis import stand_in
 
-    seen = probe_amplifier(stand_in(config))
+    try:
+        seen = probe_amplifier(stand_in(config))
+    except RigError as error:
+        warn(f"the amplifier was not tried: {error}; flowrec doctor tries it again")
+        return
     name = " ".join(filter(None, (seen.info.model, seen.info.serial)))
     say(f"amplifier {name}: {seen.amplitude_mt:.3g} mT up to {seen.rotation_hz:.3g} Hz within the limits")
     for warning in seen.warnings:

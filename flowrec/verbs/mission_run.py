@@ -290,7 +290,9 @@ class _Mission:
         if self._control.note:
             facts["note_not_finished"] = self._control.note
         doubted = [walls.text] if walls is not None and walls.other_scale else []
-        refinement_facts, refinement_doubts = judge_refinement(report.last.refined, config, known_doubts=bool(doubted))
+        refinement_facts, refinement_doubts = judge_refinement(
+            report.last.refined, config, known_doubts=bool(doubted), still=self._chip.is_still
+        )
         facts |= refinement_facts
         doubted += refinement_doubts
         if isinstance(rig, MovieRig):

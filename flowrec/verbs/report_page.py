@@ -48,6 +48,7 @@ from flowrec.exports import (
     ReportTable,
     Span,
     TimelineFigure,
+    TrackFigure,
     draw_figure,
     numbered_actions,
     render,
@@ -77,6 +78,7 @@ _HIDDEN = frozenset(  # of the outcome: shown elsewhere
         "wall_ns",
         "monotonic_ns",
         "clocks",
+        "not_refined",
         "recovered_from",
         "frames_windows",
     }
@@ -150,6 +152,8 @@ def _figures(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles]) -
     first_s = data.history.first_s
     gaps = [Span("no image", first_s + gap.at_s, first_s + gap.at_s + gap.length_s) for gap in verdict.gaps]
     changes = [ChangeFigure(pair.recorded.field, pair.replayed.field, n) for n, pair in enumerate(pairs, 1)]
+    if not data.tells_flow:
+        return [PathFigure("Path of the robot"), TrackFigure(), TimelineFigure(gaps), RecordingFigure(), *changes]
     return [
         PathFigure(),
         MapFigure(),
@@ -234,8 +238,9 @@ def _about(facts: dict[str, Any], data: ReportData) -> str:
     when = f"{str(facts['recorded'])[:16].replace('T', ' ')} UTC"
     made = f"replay of {facts['replay_of']}, made {when}" if facts["replay_of"] else f"recorded {when}"
     where = rig.get(str(facts["rig"]), f"rig {facts['rig']}")
+    chip = "open field" if facts["chip_openings"] is None else f"chip {facts['chip']}"
     named = (f"{key}: {facts[key]}" for key in ("operator", "sample") if facts.get(key))
-    return ", ".join([made, where, f"chip {facts['chip']}", goal, *named])
+    return ", ".join([made, where, chip, goal, *named])
 
 
 def _maps(data: ReportData) -> dict[str, FlowField]:
@@ -260,7 +265,7 @@ def _key_figures(data: ReportData) -> ReportTable:
         if field.error_share is not None:
             text = text_of_figure("_error", field.error_share)
             rows.append((f"{name} flow, stated error", text, f"what the {name} map expects its error to be"))
-    if data.truth is None:
+    if data.truth is None and data.tells_flow:
         rows.append(("error of the flow", "-", "not known: only a simulation knows the true flow"))
     return ReportTable("In numbers", rows, ("", "", ""))
 

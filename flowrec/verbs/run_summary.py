@@ -30,7 +30,7 @@ from flowrec.store import is_snapshot
 # What is said at the end of a run where there is any.
 _ALSO = (
     *("contacts", "frames_dropped", "speed_limit_um_s", "latest_goal"),
-    *("covered", "not_refined", "note_movie", "note_not_finished", "rrd"),
+    *("covered", "note_movie", "note_not_finished", "rrd"),
 )
 # The mission was completed, or was ended on purpose.
 GOOD_ENDS = frozenset(
@@ -137,15 +137,18 @@ def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> F
 
 
 def judge_refinement(
-    refined: FlowField | None, config: ResolvedConfig, *, known_doubts: bool
+    refined: FlowField | None, config: ResolvedConfig, *, known_doubts: bool, still: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Facts and doubts about the refined flow of a run; its scale is not doubted again if the walls' is."""
+    """Facts and doubts about the refined flow of a run; its scale is not doubted again if the walls' is.
+
+    In an open field that nothing drives, `still`, nobody asked for a flow.
+    """
     facts: dict[str, str] = {}
     doubts: list[str] = []
     if refined is None:
         return facts, doubts
     doubts += map_doubts(refined, config.camera.um_per_px, scale_known=known_doubts)
-    if refined.refused and refined.log_score is None:
+    if refined.refused and refined.log_score is None and not still:
         if config.refine.observes_flow:
             doubts.append(f"the flow was not refined: {refined.refused}")
         else:  # a movie without a log: nothing was asked that was not done

@@ -18,9 +18,10 @@ from flowrec.view.entities import FRAME, SESSION_TIME, entity_path, points
 from flowrec.view.maps import ColourBar
 from flowrec.view.scene import Box, Scene
 
-_SEVERAL_LINES = frozenset({e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
+_SEVERAL_LINES = frozenset({e.POSITION, e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
 _OVERLAYS = (e.OUTLINE, e.PATH, e.ROBOT)  # of each map, for orientation
 _SUMMARY = 0.31  # width of the text panel
+_SMALL = 0.42  # of all beside a camera without maps
 # Pixels on a small screen: its width, the height of all, that of text and plots below, the frame of the lanes and each.
 _WIDTH_PX, _ALL_PX, _BELOW_PX, _LANES_PX, _LANE_PX = 1280.0, 653.0, 345.0, 60.0, 40.0
 _FEW_LANES, _MOST_LANES = 2, 5  # more than few make the area below higher; more than most are scrolled
@@ -184,9 +185,20 @@ class _Views:
         height_px = _ALL_PX - self.below_px - _TITLE_PX
         return min(max((right - left) / (bottom - top) * height_px / _WIDTH_PX, 0.28), 0.62)
 
+    @property
+    def tells_flow(self) -> bool:
+        """False in an open field that nothing drives, where no refinement has found a flow."""
+        return not self.scene.chip.is_still or any(self._has(prefix, e.REFINED) for prefix in self.prefixes)
+
     def layout(self, camera: Shown, maps: Iterable[Part]) -> Shown:
-        """Camera and maps above; below the summary, and beside it the states over the plots."""
+        """Camera and maps above; below the summary, and beside it the states over the plots.
+
+        Without a flow to tell of the camera is as high as the window.
+        """
         width = self.camera_share
+        if not self.tells_flow:
+            texts = rrb.Vertical(*existing([tabs(*_plots(self)), self.lanes(), self.texts()]))
+            return rrb.Horizontal(camera, texts, column_shares=[1.0 - _SMALL, _SMALL])
         above: Shown = camera
         if beside := tabs(*maps):
             above = rrb.Horizontal(camera, beside, column_shares=[width, 1.0 - width])
@@ -197,7 +209,8 @@ class _Views:
 
 
 def _single(v: _Views) -> Shown:
-    camera = v.camera("Robot (orange), route (cyan), flow", ["$origin/**"], entity_path("", "camera"))
+    name = "Robot (orange), route (cyan), flow" if v.tells_flow else "Robot (orange)"
+    camera = v.camera(name, ["$origin/**"], entity_path("", "camera"))
     maps = (
         v.pair({"assumed": v.map("Assumed flow", e.ASSUMED), "refined": v.map("Refined flow", e.REFINED)}),
         v.pair(
@@ -233,9 +246,11 @@ def _double(v: _Views) -> Shown:
 def _plots(v: _Views) -> tuple[Part, ...]:
     """Three pages of plots: all of a page are seen at once, and no title is cut."""
     single = len(v.prefixes) == 1
+    told = v.tells_flow
     flow = [
         v.plot("Flow at the robot (µm/s)" if single else f"Flow, {prefix} (µm/s)", e.FLOW_SPEED, prefixes=(prefix,))
         for prefix in v.prefixes
+        if told
     ]
     nis = (e.NIS, e.NIS_MEAN) if e.PULSATION in v.present and single else (e.NIS,)
     frequency = v.plot("Field (Hz)", e.FREQUENCY)
@@ -244,8 +259,9 @@ def _plots(v: _Views) -> tuple[Part, ...]:
         _row(
             "Robot",
             *flow,
+            v.plot("Position (µm)", e.POSITION),
             v.plot("Tracking error (µm)", e.TRACKING_ERROR),
-            frequency if single else None,
+            frequency if single and told else None,
             first_share=_WITH_LEGEND if single else 1.0,
         ),
         _row(
@@ -254,10 +270,13 @@ def _plots(v: _Views) -> tuple[Part, ...]:
             v.plot("Observer NIS", *nis),
             v.plot("Pulsation (%)", e.PULSATION),
         ),
-        _row("Components", v.plot("Flow at the robot by components (µm/s)", e.FLOW_COMPONENTS) if single else None),
+        _row(
+            "Components",
+            v.plot("Flow at the robot by components (µm/s)", e.FLOW_COMPONENTS) if single and told else None,
+        ),
         _row(
             "Coils",
-            None if single else frequency,
+            None if single and told else frequency,
             v.plot("Heading (°)", e.HEADING),
             v.plot("Field (mT)", e.AMPLITUDE),
         ),

@@ -55,6 +55,7 @@ AMPLITUDE = "coils/amplitude"
 FREQUENCY = "coils/frequency"
 HEADING = "coils/heading"
 TRACKING_ERROR = "robot/tracking error"
+POSITION = "robot/position"  # where no flow is told of
 ESTIMATE_ERROR = "robot/estimate error"
 FLOW_COMPONENTS = "robot/flow components"
 FLOW_SPEED = "robot/flow speed"
@@ -72,7 +73,7 @@ LANES = (PHASE, ALARM, MARKS, LOSSES, SIGHT)
 LANES_OF_RUN = (MARKS, LOSSES, SIGHT)  # the same in a replay
 EXTRA = "extra"  # before the path of an extra topic and the field of its message
 # A session may lack these: a layout shows those that were logged.
-OPTIONAL = frozenset({*SCALES, *LANES, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING})
+OPTIONAL = frozenset({*SCALES, *LANES, POSITION, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING})
 SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"
@@ -246,6 +247,7 @@ class EntityLogger:
             FREQUENCY: {"frequency (Hz)": own},
             HEADING: {"heading (°)": own},
             TRACKING_ERROR: {"tracking error (µm)": own},
+            POSITION: {"x": colours.CYAN, "y": colours.YELLOW},
             ESTIMATE_ERROR: {"estimate error (µm)": own},
             NIS: {"NIS": own},
             NIS_MEAN: {"mean (2 is right)": colours.WHITE},

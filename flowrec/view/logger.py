@@ -37,6 +37,7 @@ from flowrec.core import (
     with_micro,
 )
 from flowrec.physics import sample
+from flowrec.stages import tells_flow
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.colours import Rgb
@@ -166,6 +167,7 @@ class TickLogger:
         self._placed_step = 0
         self._flow = maps.FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds)
         self._tick = self._last = Tick()
+        self._tells_flow = True
         left, _, right, _ = scene.image_bounds()
         self._unit_px = (right - left) / _NOMINAL_PX
         self._trail = Trail(_TRAIL_STEP_PX * self._unit_px)
@@ -179,7 +181,8 @@ class TickLogger:
 
     def log(self, tick: Tick, frame_index: int | None = None) -> None:
         """Log what is new since the previous tick; `frame_index` is for a tick without its frame."""
-        self._last, self._tick = self._tick, tick
+        self._last, self._tick = self._tick, tick.at_images(self._tick)
+        tick = self._tick
         self._entities.set_time(tick.stamp_ns, tick.frame.index if tick.frame is not None else frame_index)
         if tick.refined is not self._last.refined or tick.shift is not self._last.shift:
             # The image moves as the registration that a refinement found, and the shift of a shaking stage, say.
@@ -190,8 +193,10 @@ class TickLogger:
         self.states.end_marks(tick.stamp_ns)
         if tick.frame is not None and tick.frame is not self._last.frame:
             self._log_image(tick.frame)
-        self._flow.log_not_yet(tick, self._last)
-        self._flow.log_fields(tick, self._last)
+        self._tells_flow = tells_flow(self._scene.chip, tick)
+        if self._tells_flow:
+            self._flow.log_not_yet(tick, self._last)
+            self._flow.log_fields(tick, self._last)
         for message in tick.news(self._last, _SHOWN).values():
             self._log_message(message)
         for path, message in tick.extra.items():
@@ -300,6 +305,9 @@ class TickLogger:
         trail = self._trail.add(estimate.stamp_ns, centre)
         if len(trail) > 1:
             self._row(e.TRAIL, rr.LineStrips2D, strips=[np.array(trail)])
+        if not self._tells_flow:
+            self._scalars(e.POSITION, *place_um)
+            return
         flow = estimate.flow_um_s
         on_map = sample(field, place_um) if field is not None else (math.nan, math.nan)
         self._scalars(e.FLOW_COMPONENTS, flow[0], on_map[0], flow[1], on_map[1])

@@ -122,7 +122,7 @@ def _log_all(
         each = [zip(itertools.repeat(loggers[prefix]), found) for prefix, found in ticks.items()]
         # In the order of stamps; of equal ones the first session's comes first.
         for count, (logger, tick) in enumerate(heapq.merge(*each, key=lambda item: item[1].stamp_ns)):
-            stamp_ns = tick.stamp_ns
+            stamp_ns = tick.stamp_ns if not tick.is_afterwards else stamp_ns
             first_ns = stamp_ns if first_ns is None else first_ns
             if logger is first and tick.frame is not None:
                 index = tick.frame.index

@@ -126,7 +126,7 @@ class LiveSummary:
         self._statistics.write(tick)
         self._quality.write(tick)
         self._motion.write(tick)
-        self._last = tick
+        self._last = tick.at_images(self._last)
         self._first_ns = tick.stamp_ns if self._first_ns is None else self._first_ns
         return news
 

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from flowrec.core.errors import ChipError, FlowrecError, UsageError
 from flowrec.core.system.outputs import OutputError
+from flowrec.measure import outline
 from flowrec.measure.calibrate_chip import calibrate_chip
 from flowrec.physics.chip.chip import ChipSettings
 from flowrec.physics.chip.io import load_chip
@@ -109,3 +110,32 @@ def test_a_refused_picture_leaves_no_file(image, tmp_path):
         with pytest.raises(error, match=why):
             calibrate_chip(bad, out, 5.0, **words)
     assert [path.name for path in tmp_path.iterdir()] == ["blank.png"]
+
+
+@pytest.mark.parametrize("count", [100, 32_767, 70_000])
+def test_walls_of_any_length_are_read_from_the_picture(count):
+    ramp = np.tile(np.arange(200, dtype=np.float32), (200, 1))
+    x = np.linspace(0.0, 150.0, count)
+    points = np.column_stack([x, np.full(count, 20.0)])
+    assert np.allclose(outline._at(ramp, points), x + outline._PAD_PX, atol=0.02)
+
+
+@pytest.mark.slow("a picture with walls of more than 32767 px in all, which OpenCV does not take at once")
+def test_a_picture_of_stripes_is_refused_in_a_line(tmp_path):
+    y, x = np.mgrid[:800, :800]
+    cv2.imwrite(str(tmp_path / "stripes.png"), ((x + y) % 64 * 4).astype(np.uint8))
+    with pytest.raises(ChipError):
+        calibrate_chip(tmp_path / "stripes.png", None, 5.0)
+
+
+def test_a_mask_that_would_replace_the_picture_is_refused_with_a_name_that_does_not(image, tmp_path):
+    mine = tmp_path / "mine.png"
+    mine.write_bytes(image.read_bytes())
+    with pytest.raises(OutputError, match=r"the mask of .*mine\.toml would be written to it; .* -o .*mine_chip\.toml$"):
+        calibrate_chip(mine, tmp_path / "mine.toml", 5.0)
+
+
+def test_the_table_of_a_chip_says_how_large_it_is_so_that_a_wrong_unit_is_seen(image, capsys):
+    calibrate_chip(image, None, 0.005).show()
+    width, height = (0.005 * side for side in reversed(cv2.imread(str(image)).shape[:2]))
+    assert f"({width:.4g} um x {height:.4g} um in all)" in " ".join(capsys.readouterr().out.split())

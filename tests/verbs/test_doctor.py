@@ -159,6 +159,17 @@ def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_
 
 
 @pytest.mark.parametrize(
+    ("phases", "width_px", "level"),
+    [("survey,refine,plan,navigate", 200, WARNING), ("observe", 200, OK), ("survey,refine,plan,navigate", 640, None)],
+)
+def test_a_chip_that_the_camera_does_not_see_whole_is_noticed(phases: str, width_px: int, level: str | None) -> None:
+    chip = load_chip(ChipSettings())
+    sets = (*MEASURED, f"mission.phases={phases}", f"camera.width_px={width_px}", "camera.um_per_px=10.0")
+    found = [*diagnosis._view(resolve(with_sets(Config(), sets), chip), chip)]
+    assert [each[1] for each in found] == ([level] if level else [])
+
+
+@pytest.mark.parametrize(
     ("days", "residual_um", "level"), [(None, 1.0, WARNING), (1, 1.0, OK), (1, 90.0, WARNING), (3650, 1.0, WARNING)]
 )
 def test_a_registration_is_judged_by_its_age_and_its_residual(

@@ -15,7 +15,7 @@ from flowrec.physics.chip.io import chip_files
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.config import Config, load_config, to_toml
 from flowrec.stages.control.field_log import FieldLog
-from flowrec.verbs.first_pass import MovieTracks
+from flowrec.verbs.first_pass import MovieTracks, radius_in_image
 from flowrec.verbs.misfit import trembling as trembling_um
 from flowrec.verbs.misfit import why_unexplained
 from tests.conftest import run
@@ -181,3 +181,19 @@ def test_an_image_without_walls_says_that_shake_can_not_be_seen(known: Config, t
 def test_stabilisation_and_images_of_the_robot_alone_exclude_each_other(known: Config) -> None:
     with pytest.raises(UsageError, match=r"stabilise\.on reads the walls in every image"):
         load_config(None, ["stabilise.on=true", "recording.region=robot"])
+
+
+@pytest.mark.parametrize(("about_px", "ring"), [(4.0, False), (10.0, False), (25.0, False), (10.0, True), (25.0, True)])
+def test_the_size_of_a_body_is_that_of_its_outline_whatever_was_stated(about_px: float, *, ring: bool) -> None:
+    y, x = np.mgrid[:240, :320]
+    distance = np.hypot(x - 160.0, y - 120.0)
+    body = np.clip(10.5 - distance, 0.0, 1.0) * (np.clip(distance - 6.0, 0.0, 1.0) if ring else 1.0)
+    image = np.clip(np.random.default_rng(0).normal(180.0, 3.0, body.shape) - 120.0 * body, 0.0, 255.0)
+    place = np.array([160.4, 119.7])
+    assert radius_in_image(image.astype(np.uint8), place, about_px) == pytest.approx(10.0, abs=0.7)
+
+
+def test_a_body_without_an_outline_in_view_has_no_size() -> None:
+    grey = np.full((100, 100), 180, np.uint8)
+    grey[:, :50] = 60
+    assert radius_in_image(grey, np.array([20.0, 50.0]), 5.0) == 0.0

@@ -147,7 +147,8 @@ def test_without_a_log_the_movie_is_still_a_session_that_says_what_it_does_not_k
     assert flowrec.info(out)["not_refined"] == done.facts["not_refined"]
     assert flowrec.replay(out, verify=True).same
     said = capsys.readouterr().err
-    assert "no log of the coils: how far the robot rolled by itself is not known, so the flow is not refined" in said
+    assert "without --coils LOG the robot is tracked, and the flow is not refined" in said
+    assert not any("no log of the coils" in line for line in done.lines()), "an event of the run has said it"
     assert "observes_flow" not in said
     assert flowrec.info(out)["coil_log_file"].startswith("none")
     session = flowrec.open(out)

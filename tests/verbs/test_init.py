@@ -15,12 +15,14 @@ from flowrec.core.errors import ChipError, RigError, UsageError
 from flowrec.core.system.outputs import OutputError
 from flowrec.movies.opening import open_movie
 from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import load_config
+from flowrec.rigs.lab.cameras.probe import first_camera
+from flowrec.stages.config import Config, load_config, with_sets
 from flowrec.stages.control.coil_log import columns_by_unit
 from flowrec.stages.resolve import resolve
+from flowrec.stages.rig_settings import CameraSettings, Lab
 from flowrec.verbs.doctor import doctor
 from flowrec.verbs.init import LAB as LAB_WORD
-from flowrec.verbs.init import init
+from flowrec.verbs.init import StartedConfig, _try_amplifier, init
 from tests.extras import why
 from tests.twins.coils import device
 from tests.twins.emulator import emulated, showing
@@ -159,7 +161,7 @@ def test_a_lab_that_drives_is_asked_for_every_limit_of_robot_and_coils(
     wanted = ("robot.max_speed_um_s", "robot.step_out_hz", "robot.delay_s", "lab.serial.port", "coils.max_current_a")
     assert str(refused.value).endswith(": " + ", ".join(f"--set {key}=..." for key in wanted))
     assert "largest current of a coil, number from 0.001 to 1000 A" in capsys.readouterr().err
-    assert not (tmp_path / "lab.toml").exists()
+    assert not [*tmp_path.iterdir()], "nor a picture of the camera for each attempt"
 
 
 @pytest.mark.slow("compiles the firmware's twin, and opens a camera")
@@ -173,9 +175,6 @@ def test_init_finds_camera_and_amplifier_of_a_lab_and_leaves_its_coils_without_a
     sets |= {"robot.max_speed_um_s": 600.0, "robot.step_out_hz": 28.0, "robot.delay_s": 0.05}
     out = tmp_path / "lab.toml"
     with emulated(), device("serial", tmp_path) as coils:
-        with pytest.raises(RigError, match="no such port"):
-            init(LAB_WORD, **KNOWN, sets=sets | {"lab.serial.port": "/dev/none"}, out=out)
-        assert not out.exists()
         init(LAB_WORD, **KNOWN, sets=sets | {"lab.serial.port": coils.address}, out=out)
         assert not coils.energised()
         looked = doctor(out)
@@ -185,6 +184,29 @@ def test_init_finds_camera_and_amplifier_of_a_lab_and_leaves_its_coils_without_a
     assert (config.camera.width_px, config.camera.height_px) == (4096, 4096), "the whole sensor"
     assert config.camera.exposure_s == pytest.approx(0.01), "that of the emulator, not flowrec's default"
     assert config.lab.device == "0815-0000" and config.coils.max_current_a == 1.5
+
+
+def test_an_amplifier_that_is_not_there_yet_is_told_of_and_refuses_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    _try_amplifier(with_sets(Config(), ("rig=lab", "lab.serial.port=/dev/none", "coils.max_current_a=1.0")))
+    told = capsys.readouterr().err
+    assert "the amplifier was not tried" in told
+    assert "/dev/none" in told
+    assert "flowrec doctor" in told
+
+
+def test_one_image_with_a_channel_leads_to_a_simulated_mission_and_a_movie_to_its_import() -> None:
+    movie = StartedConfig(Path("a.png"), Path("flowrec.toml"), Path("a_chip.toml"), None, True, Path("a.png"), False)
+    assert movie.lines()[1].startswith("next: flowrec import a.png")
+    assert movie._replace(still=True).lines()[1].startswith("next: flowrec record ")
+
+
+def test_a_lab_without_a_camera_is_told_what_to_do_once_and_no_driver_speaks_for_itself(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(RigError, match=r"^no .*notebooks/08_lab\.ipynb") as refused:
+        first_camera(CameraSettings(rate_hz=30.0), Lab(), ["mmcore", "opencv"])
+    assert "device_config" not in str(refused.value)
+    assert "pymmcore" not in capfd.readouterr().err
 
 
 def test_columns_of_a_log_are_found_by_the_units_in_their_names_unless_two_have_the_same() -> None:

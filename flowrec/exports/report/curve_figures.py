@@ -108,6 +108,33 @@ class MotionFigure:
         return figure
 
 
+class TrackFigure:
+    """Position and speed of the robot over time, where there is no flow to tell of."""
+
+    name = "motion"
+    title = "Position and speed over time"
+
+    def why_not(self, data: ReportData) -> str:
+        return data.no_position
+
+    def caption(self, data: ReportData) -> str:
+        return "Estimated position of the robot, from the first pixel of the mask, and its speed over ground."
+
+    def alt(self, data: ReportData) -> str:
+        x, y = data.history.curve("x_um").known, data.history.curve("y_um").known
+        return f"Curves over time: x from {x.min():.0f} to {x.max():.0f} µm, y from {y.min():.0f} to {y.max():.0f} µm."
+
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        history = data.history
+        shown = [(name, history.curve(name)) for name in ("x_um", "y_um", "speed_um_s")]
+        shown = [(name, curve) for name, curve in shown if curve]  # a short session has no speed
+        figure, axes = panels(history, width_mm, [26.0] * len(shown))
+        for ax, (name, curve) in zip(axes, shown, strict=True):
+            line(ax, curve, style.VERMILLION, name)
+            ax.set_ylabel({"x_um": "x (µm)", "y_um": "y (µm)"}.get(name, "speed (µm/s)"))
+        return figure
+
+
 class ObserverFigure:
     """Consistency of the robot's motion with the map: the observer's health checks over time."""
 

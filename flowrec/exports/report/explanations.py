@@ -31,7 +31,7 @@ OUTCOMES: dict[str, str] = {
 # By the key of a figure; names and units are those of flowrec.core.summary.
 MEANINGS: dict[str, str] = {
     "duration_s": "session time, from the first image to the last",
-    "ticks": "images that were processed",
+    "ticks": "steps of the loop: one an image, and of a movie some after the last, which wait for the refinement",
     "axes_check": "whether the robot moved as camera and coils say, before anything was controlled",
     "planner": "method of the route",
     "route_length_um": "of the route to the goal",

@@ -24,6 +24,7 @@ from flowrec.core import (
     Timing,
     Track,
     Truth,
+    nanoseconds,
     printable,
     seconds,
 )
@@ -107,7 +108,8 @@ class History:
         ------
         SessionError : a message is damaged.
         """
-        history = cls(session.run.first_ns, session.run.last_ns)
+        first_ns = session.run.first_ns
+        history = cls(first_ns, first_ns + nanoseconds(session.duration_s))
         for tick in session.ticks(with_frames=False):
             history.add(tick)
             if history.ticks % _REPORT_EVERY == 0:
@@ -132,7 +134,8 @@ class History:
 
     def add(self, tick: Tick) -> None:
         """Take the next tick."""
-        before, self.last = self.last, tick
+        before, self.last = self.last, tick.at_images(self.last)
+        tick = self.last
         self.ticks += 1
         for message in tick.news(before, _SHOWN).values():
             self._take(message)
@@ -147,7 +150,7 @@ class History:
                 self._remark(Remark(now_s, message.text, action=message.action))
             case Mission():
                 held = message.held_since_ns is not None and not message.finished
-                self.phases.add(now_s, _name(message.phase))
+                self.phases.add(min(now_s, self.last_s), _name(message.phase))
                 self.held.add(now_s, "held" if held else "")
             case Track():
                 self.found |= message.seen

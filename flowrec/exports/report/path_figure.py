@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _MARGIN = 0.06  # around the fluid, of its width
 _OVER_PICTURE = 0.72  # opacity of the flow over the camera's picture
 _TALLEST_MM = 200.0
+_AROUND_TRACK_RADII = 4.0
 _BAR_MM, _BELOW_MM = 17.0, 6.0  # beside the picture: the colour bar; below it: the scale bar
 _SAME_PLACE = 4.0  # radii of the robot: an end this near to the goal has no name of its own
 _NEAR_EDGE = 0.08  # of the width: a name beside the edge begins or ends at its place
@@ -33,7 +34,9 @@ class PathFigure:
     """Path of the robot over the map of the flow."""
 
     name = "path"
-    title = "Path of the robot over the flow"
+
+    def __init__(self, title: str = "Path of the robot over the flow") -> None:
+        self.title = title
 
     def why_not(self, data: ReportData) -> str:
         return data.no_position
@@ -42,8 +45,7 @@ class PathFigure:
         parts = ["Line: the way of the robot (estimated position)."]
         if len(way_of(data.history.last.route)):
             parts.append("Dashes: the route that was planned last.")
-        field = data.history.last.field
-        if field is not None:
+        if data.field is not None:
             kind = "refined" if data.refined is not None else "assumed"
             parts.append(f"Colours and arrows: speed and direction of the flow by the {kind} map.")
         if data.picture is None:
@@ -65,7 +67,7 @@ class PathFigure:
     def draw(self, data: ReportData, width_mm: float) -> Figure:
         left, top, right, bottom = _bounds(data)
         aspect = (bottom - top) / (right - left)
-        picture_mm = width_mm - (_BAR_MM if data.history.last.field is not None else 2.0)
+        picture_mm = width_mm - (_BAR_MM if data.field is not None else 2.0)
         figure = style.new_figure(width_mm, min(picture_mm * aspect + _BELOW_MM, _TALLEST_MM))
         ax = figure.subplots()
         style.bare(ax)
@@ -98,6 +100,8 @@ def scale_bar(ax: Axes, per_mm: float) -> None:
 
 def _bounds(data: ReportData) -> Box:
     """Left, top, right, bottom of the fluid with a margin, within the chip, in the picture plane."""
+    if not data.tells_flow:
+        return _track_bounds(data)
     left, top, right, bottom = data.scene.fluid_bounds()
     margin = _MARGIN * (right - left)
     chip_left, chip_top, chip_right, chip_bottom = data.scene.chip_bounds()
@@ -107,6 +111,17 @@ def _bounds(data: ReportData) -> Box:
         min(right + margin, chip_right),
         min(bottom + margin, chip_bottom),
     )
+
+
+def _track_bounds(data: ReportData) -> Box:
+    """Bounds of the robot's way, which may be small in a dish, with room for the names of its ends."""
+    path = data.scene.to_plane(place_on_chip(data.history.last, data.path_um))
+    margin = _AROUND_TRACK_RADII * data.scene.length_px(data.scene.robot.radius_um)
+    (left, top), (right, bottom) = np.nanmin(path, axis=0) - margin, np.nanmax(path, axis=0) + margin
+    width, height = right - left, bottom - top
+    # Not flatter than 1 : 2, for the picture to be readable.
+    wider, higher = max(0.25 * height - 0.5 * width, 0.0), max(0.25 * width - 0.5 * height, 0.0)
+    return left - wider, top - higher, right + wider, bottom + higher
 
 
 def _background(ax: Axes, data: ReportData) -> None:
@@ -139,7 +154,7 @@ def _place(shown: AxesImage, ax: Axes, to_plane: Floats) -> None:
 
 def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
     """The speed of the best map in colours, its direction as arrows."""
-    field, scene = data.history.last.field, data.scene
+    field, scene = data.field, data.scene
     if field is None:
         return
     scale = data.speed_scale()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from flowrec.core import Floats, FlowField, Image, Observations, SessionError
 from flowrec.exports.formats import TimeProgress
 from flowrec.exports.report.history import History
+from flowrec.stages import tells_flow
 from flowrec.store import Session, nonzero_window
 from flowrec.view import ColourScale, Scene, peak
 
@@ -65,14 +66,24 @@ class ReportData:
         return data
 
     @property
+    def tells_flow(self) -> bool:
+        """False in an open field that nothing drives, where no flow was found."""
+        return tells_flow(self.scene.chip, self.history.last)
+
+    @property
     def assumed(self) -> FlowField | None:
         """The map before any refinement."""
-        return self.history.last.assumed
+        return self.history.last.assumed if self.tells_flow else None
 
     @property
     def refined(self) -> FlowField | None:
         """The map of the last refinement."""
-        return self.history.last.refined
+        return self.history.last.refined if self.tells_flow else None
+
+    @property
+    def field(self) -> FlowField | None:
+        """The best map at the end."""
+        return self.history.last.field if self.tells_flow else None
 
     @property
     def truth(self) -> FlowField | None:

@@ -85,6 +85,16 @@ class Chip:
         return self.mask.shape[1] * self.um_per_px, self.mask.shape[0] * self.um_per_px
 
     @property
+    def is_open_field(self) -> bool:
+        """True where there is no channel: all is fluid but the border of the mask."""
+        return bool(self.mask[1:-1, 1:-1].all())
+
+    @property
+    def is_still(self) -> bool:
+        """True where nobody asks for a flow: an open field whose openings drive nothing."""
+        return not any(opening.value for opening in self.openings) and self.is_open_field
+
+    @property
     def boundary_values(self) -> Floats:
         """(openings,) inlets: mean inward speed, um/s; outlets: pressure, Pa."""
         return np.array([opening.value for opening in self.openings], np.float64)

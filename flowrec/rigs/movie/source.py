@@ -160,12 +160,7 @@ class MovieSource:
     def _read_log(self, coils: Coils) -> FieldLog | None:
         settings = self._settings
         if not settings.coils:
-            if not settings.drifts:
-                self._log_remarks.append(
-                    "there is no log of the coils: how far the robot rolled by itself is not known, so the flow is not "
-                    "refined; give --coils LOG, or --set movie.drifts=true if nothing drove it"
-                )
-            return None
+            return None  # the refinement says why it is refused
         if settings.drifts:
             raise UsageError(
                 f"movie.drifts = true says that nothing drove the body, and {settings.coils} is a log of its coils; "

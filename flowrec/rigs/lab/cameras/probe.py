@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -49,13 +51,31 @@ def first_camera(camera: CameraSettings, lab: Lab, drivers: Iterable[str]) -> tu
     ------
     RigError : none finds one, or the first that does can not use it.
     """
-    found_none: list[str] = []
-    for driver in drivers:
-        try:
-            return driver, probe_camera(camera, replace(lab, camera=driver), as_it_is=True)
-        except (NoCameraError, UsageError) as error:
-            found_none.append(str(error))
-    raise RigError("no camera found; " + "; ".join(found_none))
+    found_none: dict[str, NoCameraError | UsageError] = {}
+    with _silent(logging.getLogger("pymmcore-plus")):  # what it misses is told below, once for all drivers
+        for driver in drivers:
+            try:
+                return driver, probe_camera(camera, replace(lab, camera=driver), as_it_is=True)
+            except (NoCameraError, UsageError) as error:
+                found_none[driver] = error
+    if len(found_none) == 1:
+        raise RigError("; ".join(map(str, found_none.values())))
+    looked = [driver for driver, error in found_none.items() if isinstance(error, NoCameraError)]
+    missing = dict.fromkeys(str(error) for error in found_none.values() if not isinstance(error, NoCameraError))
+    what = f"no camera found by {', '.join(looked)}" if looked else "no driver of a camera can be used"
+    raise RigError(
+        f"{what}; plug one in, see to its power and cable and whether another program uses it, or try the emulated "
+        f"camera of notebooks/08_lab.ipynb{''.join(f'; {text}' for text in missing)}"
+    )
+
+
+@contextmanager
+def _silent(logger: logging.Logger) -> Iterator[None]:
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5, *, as_it_is: bool = False) -> CameraProbe:
