@@ -87,10 +87,10 @@ def import_movie(
     from flowrec.verbs.mission_run import run_mission
 
     asked = asked_import(movie, chosen, coils=coils, times=times, fps=fps, partial=partial)
-    if not asked.movie.coils and not asked.movie.drifts:
-        say(f"{movie}: without --coils LOG the robot is tracked, and the flow is not refined")
     path = None if out is None else Path(out)
     if path is not None:  # before the whole movie is looked through
         Output(path, MCAP, (*inputs,), overwrite).check()
     looked = fit_import(asked, path.parent if path is not None else Path(), str(robot), align=align)
+    if not asked.movie.coils and not asked.movie.drifts:
+        say(f"{movie}: without --coils LOG the robot is tracked, and the flow is not refined")
     return run_mission(looked.asked, path, overwrite=overwrite, control=control, inputs=inputs, looked=looked)

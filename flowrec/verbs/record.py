@@ -152,22 +152,20 @@ def record(
     path = None if out is None else Path(out)
     if short and not dry_run:
         raise MisuseError("prints a part of what --dry-run prints; give both", "--short")
+    from flowrec.core import MCAP, Output
+
+    if path is not None:  # before imports and before the flow is solved
+        read = [*inputs, Path(chosen.start.field)] if chosen.start.field else inputs
+        Output(path, MCAP, tuple(read), overwrite).check()
     if dry_run:
-        from flowrec.core import MCAP, Output
         from flowrec.verbs.doctor import look_at_lab
         from flowrec.verbs.preparation import prepare
 
-        if path is not None:
-            Output(path, MCAP, inputs, overwrite).check()
         resolved = prepare(chosen).config
         file = inputs[0] if inputs else None
         return DryRun(
             chosen if short else resolved, short, look_at_lab(chosen, file, path) if chosen.rig == "lab" else None
         )
-    from flowrec.core import MCAP, Output
-
-    if path is not None:
-        Output(path, MCAP, tuple(inputs), overwrite).check()  # before imports and before the flow is solved
     from flowrec.store import refuse_unusable_key, sign_file
     from flowrec.verbs.mission_run import run_mission
 

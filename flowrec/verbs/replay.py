@@ -97,6 +97,8 @@ def replay(
     UsageError : a change that is not possible, or a time outside of the session.
     SessionError : the session can not be read or replayed, or `out` not be written.
     """
+    if verify and refly:
+        raise MisuseError("--verify only compares; it goes without --refly")
     if isinstance(session, Path | str):
         from flowrec.store import existing_session
 
@@ -109,8 +111,6 @@ def replay(
     change = change or named
     if jobs != 1 and not verify:
         raise MisuseError("--jobs goes with --verify: in a changed replay each tick depends on those before")
-    if verify and refly:
-        raise MisuseError("--verify only compares; it goes without --refly")
     if jobs != 1 and (change != Change() or out is not None):
         raise MisuseError("--verify --jobs only compares: it goes without --refine, --set, --out ...")
     from flowrec.verbs.replay_made import make_replay

@@ -34,7 +34,7 @@ MOVIE, LAB = SESSIONS / "movie" / "robot.mp4", SESSIONS / "movie" / "lab.toml"
         (["record", "long.toml"], 2, "bytes, more than"),
         (["import", MOVIE], 2, "flowrec init"),
         (["import", MOVIE, LAB, "--coils", "no.csv"], 2, "no.csv: no such file"),
-        (["export", GOLDEN, "a.mp4"], 2, "--format mp4"),
+        (["export", GOLDEN, "a.avi"], 2, "say which with --format"),
         (["view", GOLDEN, "--time", "3"], 2, "--screenshot"),
         (["view", GOLDEN, "--time", "99", "--screenshot", "a.png"], 2, "runs from 0 s to 7.06667 s"),
         (["cut", GOLDEN, "--from", "5", "--to", "2"], 2, "the end is before the begin"),
