@@ -308,7 +308,7 @@ def _mask(png_bytes: bytes, fluid: str, where: str) -> Bools:
     if between > _MOST_BETWEEN and len(np.unique(grey)) > _MOST_LEVELS:
         raise ChipError(
             f"{where}: a photograph, not a mask: {100 * between:.0f} % of its pixels are neither black nor white; "
-            f"flowrec calibrate chip {where} --um-per-px UM -o drawn.toml makes the mask of it"
+            f"flowrec calibrate chip {where} --um-per-px UM -o CHIP.toml makes the mask of it"
         )
     mask = np.asarray(grey) >= 128
     if fluid == "dark":
