@@ -26,6 +26,7 @@ from flowrec.bench.plan import FULL, TREES, plan_trip
 from flowrec.bench.plan import METHODS as PLANS
 from flowrec.bench.track import FIXED_PACE, LAWS, WORLDS, flight, score
 from flowrec.bench.trips import SPEED_UM_S, Points, Trip, TripCase, best_time, draw_trip, worlds
+from flowrec.bench.vessel_truth import read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case
 from flowrec.core import FlowError, FlowField, Observations, Tick, seconds
 from flowrec.physics import sample
@@ -265,10 +266,12 @@ def _branch(places: Points, known: FlowField | None) -> str | None:
     return "long" if float(np.median(middle[:, 1])) < 0.45 * height_um else "short"
 
 
-def _picture(velocity_um_s: NDArray[np.floating], fluid: NDArray[np.bool_], um_per_px: float) -> Results:
+def _picture(
+    velocity_um_s: NDArray[np.floating], fluid: NDArray[np.bool_], um_per_px: float, top_um_s: float | None = None
+) -> Results:
     """The speed as an image for a figure: rows of numbers from 0 to 1 of `top_um_s`; -1 in solid."""
     speed = np.linalg.norm(velocity_um_s.astype(np.float64), axis=-1)
-    top = float(np.percentile(speed[fluid], 99.5))
+    top = top_um_s or float(np.percentile(speed[fluid], 99.5))
     image = np.where(fluid, np.minimum(speed / max(top, 1e-9), 1.0), -1.0).round(2)
     return {"image": image.ravel().tolist(), "image_width": image.shape[1], "top_um_s": top, "um_per_px": um_per_px}
 
@@ -340,5 +343,8 @@ def _refined(path: Path, method: str, scenario: Scenario, traced: bool) -> Resul
         found |= {"method_s": row["cpu_seconds"], "update_s": row["seconds_update"]}
         if traced:
             with np.load(next(fields.glob("*.npz"))) as field:
-                found |= _picture(field["velocity_um_s"], field["mask"], 1.0)
+                true = _picture(read_true_velocity(path), field["mask"], 1.0)
+                found |= _picture(field["velocity_um_s"], field["mask"], 1.0, true["top_um_s"]) | {
+                    "truth": true["image"]
+                }
     return found
