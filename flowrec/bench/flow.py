@@ -206,7 +206,7 @@ def refine_case(
         **{"rmse_vx": error.vx, "rmse_vy": error.vy, "rmse_v": error.v, "rmse_speed": _relative(speed, true_speed)},
         "rmse_p": None
         if true_pa is None
-        else _relative(*(_centred(p[chip.mask]) for p in (field.pressure_pa, true_pa))),
+        else _relative(*(_less_mean(p[chip.mask]) for p in (field.pressure_pa, true_pa))),
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "seconds_update": seconds_update,
@@ -223,8 +223,8 @@ def _relative(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:
     return float(np.linalg.norm(found - true) / max(float(np.linalg.norm(true)), 1e-300))
 
 
-def _centred(pressure: NDArray[np.floating]) -> NDArray[np.floating]:
-    return pressure - pressure.mean()
+def _less_mean(pressure: NDArray[np.floating]) -> NDArray[np.floating]:
+    return np.asarray(pressure - pressure.mean())
 
 
 def _on_device(method: Refiner | NullModel, device: Device) -> Refiner | NullModel:

@@ -1,9 +1,9 @@
 """`flowrec bench paper`: every figure, table and experiment of the paper (arXiv 2503.11124) on the simulated rig.
 
 EXPERIMENTS is the list. A case is one cell of an experiment with one seed; its row is appended to rows.jsonl of the
-folder when it ends, with the commit, processor, date and numerics that made it. A run that was stopped goes on: what has a row is
-not computed again. Seeds are taken in order, so that a stop leaves cells of equal size. At the end rows.parquet and the
-figures, 88 and 180 mm wide, are made of the rows. `--seeds 0:0` makes these alone.
+folder when it ends, with the commit, processor, date and numerics that made it. A run that was stopped goes on: what
+has a row is not computed again. Seeds are taken in order, so that a stop leaves cells of equal size. At the end
+rows.parquet and the figures, 88 and 180 mm wide, are made of the rows. `--seeds 0:0` makes these alone.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from flowrec.bench.harness import (
     print_rows,
     wilson,
 )
+from flowrec.bench.track import LAWS
 from flowrec.core import FlowrecError, UsageError, append_line, progress, provenance, replacing, say
 
 Cell = dict[str, Any]
@@ -79,7 +80,7 @@ _NAVIGATIONS = ("astar_paper", "astar_length", "time_field", "policy")
 
 
 def _missions(world: str, sampler: str, *navigations: str) -> dict[str, Sequence[Any]]:
-    """Cells of missions on the map of a survey whose observations are trimmed as in the paper, or as the filter has them."""
+    """Cells of missions on the map of a survey, trimmed as in the paper or as the filter has it."""
     given = {"chip": _CHIPS, "world": (world,), "sampler": (sampler,)}
     return {**given, "way": ("down", "up"), "navigation": navigations}
 
@@ -96,8 +97,8 @@ EXPERIMENTS: dict[str, Experiment] = {
         _missions("kind", "trimmed", "without", "with observer", "energy"),
     ),
     "missions_untrimmed": Experiment("Fig. 10", cases.mission, _missions("moderate", "filter", *_NAVIGATIONS)),
-    "tracking_ideal": Experiment("Fig. 7 and 8", cases.tracking, {"world": ("ideal",), "law": tuple(cases.LAWS)}, 1),
-    "tracking": Experiment("Fig. 7 and 8", cases.tracking, {"world": ("all",), "law": tuple(cases.LAWS)}),
+    "tracking_ideal": Experiment("Fig. 7 and 8", cases.tracking, {"world": ("ideal",), "law": tuple(LAWS)}, 1),
+    "tracking": Experiment("Fig. 7 and 8", cases.tracking, {"world": ("all",), "law": tuple(LAWS)}),
     "planning": Experiment(
         "Fig. 5 and 6",
         cases.trip,
@@ -164,13 +165,12 @@ def measure(
         If there is no such experiment, the rows in the folder can not be read, or a package is missing.
     """
     names = choose_names("bench paper: no experiment", only, experiments)
-    for package, extra in (("pyarrow", "export"),):
-        if importlib.util.find_spec(package) is None:
-            raise UsageError(f"bench paper needs {package}, which is not installed: pip install 'flowrec[{extra}]'")
+    if importlib.util.find_spec("pyarrow") is None:
+        raise UsageError("bench paper needs pyarrow, which is not installed: pip install 'flowrec[export]'")
     need_matplotlib()
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "rows.jsonl"
-    rows = read_rows(file)
+    rows = read_rows(file, experiments)
     first, end = (int(each) for each in seeds.split(":"))
     here = []
     for name in names:
@@ -224,13 +224,13 @@ def row_key(name: str, cell: Cell, seed: int) -> str:
     return json.dumps([name, sorted((key, value) for key, value in cell.items()), seed])
 
 
-def read_rows(path: Path) -> dict[str, Results]:
+def read_rows(path: Path, experiments: dict[str, Experiment]) -> dict[str, Results]:
     """The rows of a file by their key; of two of one case the later. UsageError: it holds something else."""
     rows: dict[str, Results] = {}
     for number, line in enumerate(kept_lines(path), 1):
         try:
             row = json.loads(line)
-            cell = {name: row[name] for name in EXPERIMENTS[row["experiment"]].cells}
+            cell = {name: row[name] for name in experiments[row["experiment"]].cells}
             rows[row_key(row["experiment"], cell, row["seed"])] = row
         except (ValueError, TypeError, KeyError) as error:
             raise UsageError(f"{path}, line {number}: is no row of bench paper; name another folder") from error
@@ -302,11 +302,19 @@ def share_of(rows: Sequence[Results], name: str) -> Results:
     return {"mean": true / max(len(rows), 1), "interval_95": wilson(true, len(rows)), "count": len(rows)}
 
 
-def compare(a: Sequence[Results], b: Sequence[Results], name: str) -> Results:
-    """`paired_ratio` of a value of rows over that of other rows of the same seed; seeds of which one has none are out."""
-    values = [{row["seed"]: row[name] for row in rows if row.get(name) is not None} for rows in (a, b)]
-    both = sorted(set(values[0]) & set(values[1]))
-    return paired_ratio(np.array([values[0][seed] / values[1][seed] for seed in both], np.float64))
+def compare(rows: Iterable[Results], by: str, a: str, b: str, name: str) -> Results:
+    """`paired_ratio` of a value of the rows whose `by` is `a` over that of those whose `by` is `b`.
+
+    Rows are a pair that have the seed and all other values of their cells in common; what has no partner is left out.
+    """
+    values: dict[str, dict[str, float]] = {}
+    for row in rows:
+        if row["failed"] or row.get(name) is None:
+            continue
+        cell = {key: row[key] for key in EXPERIMENTS[row["experiment"]].cells if key != by}
+        values.setdefault(row[by], {})[row_key(row["experiment"], cell, row["seed"])] = row[name]
+    one, other = values.get(a, {}), values.get(b, {})
+    return paired_ratio(np.array([one[key] / other[key] for key in sorted(one.keys() & other.keys())], np.float64))
 
 
 def as_text(found: Results, template: str = "{:.3f}") -> str:
@@ -318,7 +326,7 @@ def as_text(found: Results, template: str = "{:.3f}") -> str:
 
 
 def summary(name: str, experiment: Experiment, rows: Sequence[Results]) -> Results:
-    """How far an experiment is, and what the cells that are meant take: `left_h` is CPU time."""
+    """The state of an experiment: cases of its cells, CPU time spent and, to CASES_A_CELL in each, left."""
     counts = [sum(_is(row, name, cell) for row in rows) for cell in experiment.each_cell()]
     mine = [row for row in rows if row["experiment"] == name]
     spent = sum(row["cpu_seconds"] for row in mine)
@@ -341,7 +349,7 @@ def _is(row: Results, name: str, cell: Cell) -> bool:
 
 
 def show(results: Results) -> None:
-    """Print how far each experiment is; the numbers are in rows.parquet, and notebook 05 makes its tables of them."""
+    """Print the state of each experiment; the numbers are in rows.parquet, and notebook 05 makes its tables of them."""
     print_rows(
         f"Rows of the paper, by {'; '.join(results['commits']) or 'nobody yet'}; left: to {CASES_A_CELL} cases a cell",
         results["cells"],

@@ -1,4 +1,4 @@
-"""What `flowrec bench paper` computes: a function for each kind of case, from its cell and a seed to a row of results.
+"""The cases of `flowrec bench paper`: a function for each kind, from its cell and a seed to the results of a row.
 
 Each calls the bench that measures the same by itself. What several cells of a seed have in common (a survey, a vessel,
 a network with a trip through it) is kept until the next seed, so that they are compared on the same.
@@ -71,7 +71,7 @@ ABLATION: dict[str, PiUnet] = {
 def survey(seed: int, data: Path | None, chip: str, world: str, sampler: str) -> Results:
     """Error of the flow before and after the refinement of a survey; of the first seed also Fig. 11."""
     del data
-    flown = _surveyed(seed, chip, world, sampler)
+    flown = _flown_survey(seed, chip, world, sampler)
     last, truth, ticks = flown
     assert last.assumed is not None and last.refined is not None and last.observations is not None
     fluid = np.any(truth.velocity_um_s != 0.0, axis=-1)
@@ -84,8 +84,8 @@ def survey(seed: int, data: Path | None, chip: str, world: str, sampler: str) ->
     }
     if seed != TRACED_SEED:
         return found
-    seen = _treated(last.observations, sampler)
-    estimates = _thinned([one for one in ticks if one.estimate is not None])
+    seen = _treat(last.observations, sampler)
+    estimates = _every_few([one for one in ticks if one.estimate is not None])
     return found | {
         "trace_s": [seconds(one.stamp_ns - ticks[0].stamp_ns) for one in estimates],
         "trace_um_s": [float(np.hypot(*one.estimate.flow_um_s)) for one in estimates if one.estimate is not None],
@@ -99,7 +99,7 @@ def survey(seed: int, data: Path | None, chip: str, world: str, sampler: str) ->
 def mission(seed: int, data: Path | None, chip: str, world: str, sampler: str, way: str, navigation: str) -> Results:
     """Navigation through the whole chip on the map of a survey in the same world, from inlet to outlet or back."""
     del data
-    known, _, _ = _surveyed(seed, chip, world, sampler)
+    known, _, _ = _flown_survey(seed, chip, world, sampler)
     ticks: list[Tick] = []
     start, true = Tick(refined=known.refined), TrueWorld(world, "ample", NAVIGATIONS[navigation])
 
@@ -176,8 +176,8 @@ def refinement(seed: int, data: Path | None, vessels: str, method: str, level: i
     if vessels == "openfoam":
         assert data is not None
         path = data / "vessels" / f"case_{seed:02d}.npz"
-        return _refined(path, method, Scenario(k=level), seed == TRACED_SEED and level == Scenario().k)
-    return _refined_arrays(_vessel(seed, vessels, data), method, seed == TRACED_SEED)
+        return _refine(path, method, Scenario(k=level), seed == TRACED_SEED and level == Scenario().k)
+    return _refine_arrays(_vessel(seed, vessels, data), method, seed == TRACED_SEED)
 
 
 def sensitivity(seed: int, data: Path | None, varied: str, level: float, method: str) -> Results:
@@ -196,7 +196,7 @@ def sensitivity(seed: int, data: Path | None, varied: str, level: float, method:
         arrays["op_u_assumed"] = arrays["op_u_true"] * (1.0 + level * signs)
     else:  # viscosity, wrong by this factor
         arrays["mu_assumed"], arrays["rho_assumed"] = arrays["mu"] * level, arrays["rho"]
-    return _refined_arrays(arrays, method, traced=False)
+    return _refine_arrays(arrays, method, traced=False)
 
 
 def swim_energy(field: FlowField, waypoints_um: Points, arrival_s: NDArray[np.float64]) -> float:
@@ -221,7 +221,7 @@ def _chip(name: str) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=8)
-def _surveyed(seed: int, chip: str, world: str, sampler: str) -> tuple[Tick, FlowField, list[Tick]]:
+def _flown_survey(seed: int, chip: str, world: str, sampler: str) -> tuple[Tick, FlowField, list[Tick]]:
     """The last tick of a survey, the true flow, and all ticks without their images."""
     ticks: list[Tick] = []
     true = TrueWorld(world, "ample", (*_SURVEY, f"sampler.method={sampler}"))
@@ -238,13 +238,13 @@ def _bare(tick: Tick) -> Tick:
     return replace(tick, frame=None)
 
 
-def _treated(observations: Observations, sampler: str) -> Observations:
+def _treat(observations: Observations, sampler: str) -> Observations:
     from flowrec.stages import Trimmed
 
     return Trimmed().treat(observations) if sampler == "trimmed" else observations
 
 
-def _thinned(ticks: list[Tick]) -> list[Tick]:
+def _every_few(ticks: list[Tick]) -> list[Tick]:
     return ticks[:: max(len(ticks) // TRACE_POINTS, 1)]
 
 
@@ -256,7 +256,7 @@ def _swum(ticks: list[Tick]) -> float:
 
 
 def _branch(places: Points, known: FlowField | None) -> str | None:
-    """Which branch of the bifurcation a path took: the long one lies in the upper half of the chip."""
+    """The branch of the bifurcation that a path took: the long one lies in the upper half of the chip."""
     if known is None or not len(places):
         return None
     height_um, width_um = (known.um_per_px * size for size in known.velocity_um_s.shape[:2])
@@ -325,14 +325,14 @@ def _mask(path: Path) -> NDArray[np.bool_]:
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) > 0
 
 
-def _refined_arrays(arrays: dict[str, Any], method: str, traced: bool) -> Results:
+def _refine_arrays(arrays: dict[str, Any], method: str, traced: bool) -> Results:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "case.npz"
         np.savez(path, allow_pickle=False, **arrays)
-        return _refined(path, method, Scenario(), traced)
+        return _refine(path, method, Scenario(), traced)
 
 
-def _refined(path: Path, method: str, scenario: Scenario, traced: bool) -> Results:
+def _refine(path: Path, method: str, scenario: Scenario, traced: bool) -> Results:
     """Scores of a refinement; `error` is the relative RMSE of the velocity."""
     refiner = Refiner("pi_unet", pi_unet=ABLATION[method]) if method in ABLATION else METHODS[method]
     with tempfile.TemporaryDirectory() as folder:
