@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flowrec.bench.figures import colours
 from flowrec.bench.harness import Results
-from flowrec.bench.paper import mean_of, select
+from flowrec.bench.paper_rows import mean_of, select
 from flowrec.core import MM_PER_UM, replacing
 from flowrec.exports import style
 

@@ -7,18 +7,9 @@ import numpy as np
 import pytest
 
 from flowrec.bench import paper
-from flowrec.bench.paper import (
-    Experiment,
-    compare,
-    mean_of,
-    measure,
-    read_parquet,
-    read_rows,
-    row_key,
-    select,
-    share_of,
-)
+from flowrec.bench.paper import Experiment, compare, measure, read_rows, row_key
 from flowrec.bench.paper_figures import FIGURES, draw
+from flowrec.bench.paper_rows import mean_of, read_parquet, select, share_of, write_parquet
 from flowrec.core.errors import FlowError, UsageError
 
 CELLS = {"method": ("a", "b"), "level": (1, 2)}
@@ -108,7 +99,7 @@ def test_the_table_has_the_rows_as_they_were_written(tmp_path):
         {"experiment": "toy", "seed": 0, "failed": "", "error": 1, "trace": [0.5, 0.25], "reached": True},
         {"experiment": "toy", "seed": 1, "failed": "", "error": 0.5, "note": "x"},
     ]
-    paper.write_parquet(rows, tmp_path / "rows.parquet")
+    write_parquet(rows, tmp_path / "rows.parquet")
     assert read_parquet(tmp_path / "rows.parquet") == rows
 
 
