@@ -203,8 +203,9 @@ def survey(rows: Rows, figure: Figure) -> None:
         x, y = (MM_PER_UM * np.asarray(row[f"seen_{axis}_um"]) for axis in "xy")
         top = MM_PER_UM * row["top_um_s"]
         dots = seen.scatter(x, y, c=MM_PER_UM * np.asarray(row["seen_um_s"]), s=5, cmap=_SPEEDS, vmin=0.0, vmax=top)
+        height, width = np.multiply(_pixels(row["image"], row["image_width"]).shape, MM_PER_UM * row["um_per_px"])
         seen.set(title="(b) observations", xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
-        seen.invert_yaxis()
+        seen.set(xlim=(0.0, width), ylim=(height, 0.0))  # y points down
         _show(refined, row["image"], row["image_width"], row["um_per_px"])
         refined.set_title(f"(c) refined, error {row['refined_error']:.3f}")
         style.bare(refined)
