@@ -57,8 +57,10 @@ def share_of(rows: Sequence[Results], name: str) -> Results:
 
 
 def as_text(found: Results, template: str = "{:.3f}") -> str:
-    """Mean, interval and number of a result of `mean_of`, `share_of` or `compare`."""
+    """Mean, interval and number of a result of `mean_of`, `share_of` or `compare`; one value alone has no interval."""
     if not found["count"]:
         return "none"
+    if found["count"] == 1 and found["interval_95"][0] == found["interval_95"][1]:
+        return f"{template.format(found['mean'])} (n 1)"
     low, high = (template.format(each) for each in found["interval_95"])
     return f"{template.format(found['mean'])} ({low} to {high}; n {found['count']})"

@@ -9,7 +9,7 @@ import pytest
 from flowrec.bench import paper
 from flowrec.bench.paper import Experiment, compare, measure, read_rows, row_key
 from flowrec.bench.paper_figures import FIGURES, draw
-from flowrec.bench.paper_rows import mean_of, read_parquet, select, share_of, write_parquet
+from flowrec.bench.paper_rows import as_text, mean_of, read_parquet, select, share_of, write_parquet
 from flowrec.core.errors import FlowError, UsageError
 
 CELLS = {"method": ("a", "b"), "level": (1, 2)}
@@ -137,6 +137,12 @@ def test_the_interval_of_a_mean_shrinks_with_the_number_of_cases():
     half = [{"reached": number % 2 == 0} for number in range(100)]
     few, many = share_of(half[:10], "reached"), share_of(half, "reached")
     assert np.diff(many["interval_95"]) < 0.5 * np.diff(few["interval_95"])
+
+
+def test_one_value_alone_has_no_interval_but_a_share_has():
+    assert as_text(mean_of([{"x": 2.0}], "x"), "{:.1f}") == "2.0 (n 1)"
+    assert as_text(share_of([{"x": True}], "x"), "{:.0%}") == "100% (21% to 100%; n 1)"
+    assert as_text(mean_of([], "x")) == "none"
 
 
 def test_a_value_that_a_row_lacks_does_not_count():
