@@ -84,7 +84,7 @@ def flow_maps(rows: Rows, figure: Figure) -> None:
         axes.flat[0].set_title("truth")
         for ax, name in zip(axes.flat[1:], names, strict=False):
             _show(ax, found[name]["image"], found[name]["image_width"])
-            ax.set_title(f"{name} {found[name]['error']:.3f}")
+            ax.set_title(f"{name}\n{found[name]['error']:.3f}", pad=1.5)
         block.suptitle(VESSELS[kind], x=0.01, ha="left", fontsize=7)
 
 
@@ -185,7 +185,7 @@ def mission_times(rows: Rows, figure: Figure) -> None:
                 _spread(ax, place, some, "time_s", colour)
                 if lost := sum(not row["reached"] for row in some):
                     ax.annotate(f"{lost}×", (place, 0.98), xycoords=("data", "axes fraction"), ha="center", va="top")
-        ax.set_ylim(bottom=0.0)
+        ax.set_ylim(0.0, 1.15 * max((row["time_s"] for row in mine if row.get("time_s")), default=1.0))
         count = len({row["seed"] for row in mine})
         ax.set_title(f"{panel[0]}, {panel[1]}, {panel[2]}, n ≤ {count}")
         ax.set_ylabel("time to the goal (s)")
@@ -207,9 +207,11 @@ def survey(rows: Rows, figure: Figure) -> None:
         seen.set(title="(b) observations", xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
         seen.set(xlim=(0.0, width), ylim=(height, 0.0))  # y points down
         _show(refined, row["image"], row["image_width"], row["um_per_px"])
-        refined.set_title(f"(c) refined, error {row['refined_error']:.3f}")
+        refined.set_title(f"(c) refined: {row['refined_error']:.3f}")
         style.bare(refined)
-        figure.colorbar(dots, ax=[seen, refined], label="mm/s", shrink=0.7)
+        below = _is_narrow(figure)
+        place = {"ax": refined, "orientation": "horizontal"} if below else {"ax": [seen, refined], "shrink": 0.7}
+        figure.colorbar(dots, label="mm/s", **place)  # type: ignore[arg-type]
 
 
 def sensitivity(varied: str, vessels: str, label: str, *, log: bool) -> Callable[[Rows, Figure], None]:
@@ -254,13 +256,13 @@ def ablation(rows: Rows, figure: Figure) -> None:
 # By name: the experiments without whose rows there is nothing to draw, the drawing, heights in mm of 88 and 180 mm.
 FIGURES: dict[str, tuple[str, Callable[[Rows, Figure], None], tuple[float, float]]] = {
     "table_1": ("table_1_drawn", table_1, (140.0, 140.0)),
-    "fig_4": ("table_1_drawn", flow_maps, (190.0, 190.0)),
+    "fig_4": ("table_1_drawn", flow_maps, (230.0, 210.0)),
     "fig_5": ("planning", plan_bars, (100.0, 100.0)),
     "fig_6": ("planning", plan_paths, (75.0, 105.0)),
     "fig_7_8": ("tracking_ideal", tracking, (120.0, 70.0)),
     "fig_10": ("survey", mission_paths, (110.0, 150.0)),
-    "missions": ("missions", mission_times, (230.0, 170.0)),
-    "fig_11": ("survey", survey, (150.0, 90.0)),
+    "missions": ("missions", mission_times, (260.0, 190.0)),
+    "fig_11": ("survey", survey, (125.0, 90.0)),
     "sens_share": (
         "sens_share",
         sensitivity("share", "drawn", "observed share of the skeleton", log=True),
