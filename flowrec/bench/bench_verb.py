@@ -10,6 +10,7 @@ from flowrec.core import UsageError
 from flowrec.verbs import WholeDescriptions
 
 BENCHES = {
+    "paper": "The paper, all of it: each figure, table and experiment; goes on after a stop.",
     "flow": "Refinement: error of the flow before and after each method (Table I and Fig. 4 of the paper).",
     "survey": "The survey: error of the flow with as many observations along different ways.",
     "plan": "Planning: path length and travel time of each planner, upstream and downstream, over the least time.",

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from flowrec.bench.figure_flow import FlowPanels, draw, median_case
 from flowrec.bench.harness import (
@@ -30,7 +31,7 @@ from flowrec.bench.harness import (
     vessel_cases,
 )
 from flowrec.bench.null_models import NULL_MODELS, NullModel
-from flowrec.bench.vessel_truth import read_observations, read_true_velocity
+from flowrec.bench.vessel_truth import read_observations, read_true_pressure, read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
 from flowrec.core import (
     FlowError,
@@ -166,10 +167,13 @@ def _prepare() -> float:
     return peak_mb()
 
 
-def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None = None) -> dict[str, Any]:
-    """Refine one case, then read its truth and score the result.
+def refine_case(
+    case: Path, method: str, scenario: Scenario, fields: Path | None = None, refiner: Refiner | NullModel | None = None
+) -> dict[str, Any]:
+    """Refine one case by a row of METHODS or by `refiner`, then read its truth and score the result.
 
-    `rmse_*` are relative RMSE over the fluid pixels of the true mask. `seconds` and `cpu_seconds` include the first
+    `rmse_*` are relative RMSE over the fluid pixels of the true mask; that of the pressure, None where the case does
+    not have it, is of the pressure less its mean. `seconds` and `cpu_seconds` include the first
     solution of the flow; `seconds_update` is the time for other observations of the same case, with filled caches.
     `within_2_std`, `stated_over_true` and `crps` are those of `flow_scores`; `peak_mb` and `gpu_mb` are the peak memory
     of this process and of what it has on a GPU.
@@ -177,7 +181,7 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
     chip = read_vessel_case(case)
     observations = scenario.observe(case)
     assumed_chip = with_mask_error(chip, scenario.mask)
-    solver, refiner = FlowSolver(scenario.k), _on_device(METHODS[method], scenario.device)
+    solver, refiner = FlowSolver(scenario.k), _on_device(refiner or METHODS[method], scenario.device)
     clear_cache()
     began, began_cpu = time.perf_counter(), time.process_time()
     assumed = solver.solve(assumed_chip)
@@ -195,9 +199,14 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
     true = read_true_velocity(case)
     error = relative_rmse(field, replace(field, velocity_um_s=true.astype(np.float32)), chip.mask)
     scores = flow_scores(field, true, chip.mask)
+    speed, true_speed = (np.linalg.norm(each[chip.mask], axis=-1) for each in (field.velocity_um_s, true))
+    true_pa = read_true_pressure(case)
     return {
         **{"case": case.stem, "method": method},
-        **{"rmse_vx": error.vx, "rmse_vy": error.vy, "rmse_v": error.v},
+        **{"rmse_vx": error.vx, "rmse_vy": error.vy, "rmse_v": error.v, "rmse_speed": _relative(speed, true_speed)},
+        "rmse_p": None
+        if true_pa is None
+        else _relative(*(_less_mean(p[chip.mask]) for p in (field.pressure_pa, true_pa))),
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "seconds_update": seconds_update,
@@ -208,6 +217,14 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
         "gpu_mb": _gpu_mb(scenario.device),
         "note": field.note,
     }
+
+
+def _relative(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:
+    return float(np.linalg.norm(found - true) / max(float(np.linalg.norm(true)), 1e-300))
+
+
+def _less_mean(pressure: NDArray[np.floating]) -> NDArray[np.floating]:
+    return np.asarray(pressure - pressure.mean())
 
 
 def _on_device(method: Refiner | NullModel, device: Device) -> Refiner | NullModel:

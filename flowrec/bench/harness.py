@@ -25,7 +25,20 @@ import typer
 from numpy.typing import NDArray
 from typer.core import TyperCommand
 
-from flowrec.core import FIGURE, JSON, FlowField, FlowrecError, Output, StoppedError, UsageError, looked_at, say, table
+from flowrec.core import (
+    FIGURE,
+    JSON,
+    FlowField,
+    FlowrecError,
+    Output,
+    StoppedError,
+    UsageError,
+    looked_at,
+    provenance,
+    replace_content,
+    say,
+    table,
+)
 from flowrec.verbs import HELP_WIDTH, AsJson, CommandLineError, FiniteNumbers, Overwrite, Stoppable, usage_line
 
 Results = dict[str, Any]
@@ -140,6 +153,25 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         **{package: version(package) for package in ("numpy", "scipy")},
     }
+
+
+def code_version() -> str:
+    """The version and the commit of this flowrec."""
+    facts = provenance(anonymous=True)
+    changed = " with local changes" if facts.get("git_changed") == "True" else ""
+    return f"flowrec {facts['flowrec']} {facts.get('git_commit', '')[:10]}{changed}"
+
+
+def kept_lines(path: Path) -> list[str]:
+    """The lines of a file that a bench appends to; none of a file that is not there, nor one that was cut short."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+    return lines[:-1] if lines and not lines[-1].endswith("\n") else lines
+
+
+def cut_torn_end(path: Path) -> None:
+    """Cut off a last line that has no end."""
+    if path.exists() and not (data := path.read_bytes()).endswith(b"\n"):
+        replace_content(path, data[: data.rfind(b"\n") + 1])
 
 
 def choose_names(what: str, names: str | None, known: Iterable[str]) -> tuple[str, ...]:

@@ -270,8 +270,12 @@ def fly(
     policy: str,
     world: TrueWorld,
     watch: Callable[[Tick], None] | None = None,
+    start: Tick | None = None,
 ) -> Row:
-    """One mission; `known` is the map, surveyed or assumed. `watch` gets every tick."""
+    """One mission; `known` is the map, surveyed or assumed. `watch` gets every tick.
+
+    `start` has what is known before, such as the refined flow of an earlier mission in the same world.
+    """
     sets = [*chip_sets, f"simulated.seed={seed}", *COILS[world.coils], *TRIPS[way, known], *POLICIES[policy]]
     sets += [*_KNOWN.get(world.name, ()), *world.sets]
     asked = load_config(None, sets)
@@ -285,7 +289,7 @@ def fly(
     except FlowrecError as error:  # before anything is switched on
         return Row(world.name, seed, name, way, known, policy, "refused", str(error))
     log = MissionLog(CommandLimits(config.coils, config.robot, OutputLimits()))
-    report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [log], on_tick=watch)
+    report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [log], start, on_tick=watch)
     mission, outcome = report.last.mission, report.outcome
     assert mission is not None
     taken_s = best_s = planned_s = None

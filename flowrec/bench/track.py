@@ -63,10 +63,10 @@ OURS = ("paper, with compensation", "vector, kalman", "vector, kalman_map")
 
 # The paper's reference moves on wherever the robot is. That of flowrec is no faster than the robot, and by default it
 # waits for a robot that is behind.
-_FIXED = Controller(lag_free_radii=1e9, lag_full_radii=2e9, pace_share=1e9)
+FIXED_PACE = Controller(lag_free_radii=1e9, lag_full_radii=2e9, pace_share=1e9)
 PACES = {
-    "as planned": _FIXED,
-    "limited speed": replace(_FIXED, pace_share=Controller().pace_share),
+    "as planned": FIXED_PACE,
+    "limited speed": replace(FIXED_PACE, pace_share=Controller().pace_share),
     "limited speed, waits": Controller(),
 }
 
@@ -87,7 +87,7 @@ def measure(
     with progress("tracking", total, "runs") as done:
         for world_name, world in WORLDS.items():
             for name, law in LAWS.items():
-                flown[name, world_name] = flights(law, _FIXED, world, seeds)
+                flown[name, world_name] = flights(law, FIXED_PACE, world, seeds)
                 done(len(flown))
         for top_um_s in STEP_OUTS_UM_S:
             world = replace(ALL, step_out_um_s=top_um_s)
@@ -116,11 +116,15 @@ def measure(
 
 def flights(law: ControlLoop, pace: Controller, world: RunDisturbances, seeds: int) -> list[LemniscateRun]:
     """One run per seed; one run if there is no noise."""
+    return [flight(law, pace, world, seed) for seed in range(seeds if world.noise_um > 0.0 else 1)]
+
+
+def flight(law: ControlLoop, pace: Controller, world: RunDisturbances, seed: int) -> LemniscateRun:
+    """One run with the noise of a seed."""
     # The noise that a robot at rest would show.
     kalman = Kalman(position_noise_um=world.noise_um if world.noise_um > 0.0 else None)
     observer = with_row(Observer(kalman=kalman), OBSERVERS, law.observer)
-    controller, robot = with_row(pace, CONTROLLERS, law.method), world.robot(law.v_max_um_s)
-    return [fly(controller, observer, robot, world, seed) for seed in range(seeds if world.noise_um > 0.0 else 1)]
+    return fly(with_row(pace, CONTROLLERS, law.method), observer, world.robot(law.v_max_um_s), world, seed)
 
 
 def score(name: str, world: str, flown: list[LemniscateRun]) -> dict[str, Any]:
@@ -132,17 +136,17 @@ def score(name: str, world: str, flown: list[LemniscateRun]) -> dict[str, Any]:
     """
     steady = flown[0].time_s >= PERIOD_S
     curve = KDTree(lemniscate(1).waypoints_um - CENTRE_UM)  # a point every 3 um
-    converged = [_converged_s(flight) for flight in flown]
+    converged = [_converged_s(one) for one in flown]
     return {
         "law": name,
         "world": world,
-        "rmse_um": _mean([_rms(flight.error_um) for flight in flown]),
-        "steady_um": _mean([_rms(flight.error_um[steady]) for flight in flown]),
-        "off_curve_um": _mean([_rms(curve.query(flight.position_um[steady])[0]) for flight in flown]),
+        "rmse_um": _mean([_rms(one.error_um) for one in flown]),
+        "steady_um": _mean([_rms(one.error_um[steady]) for one in flown]),
+        "off_curve_um": _mean([_rms(curve.query(one.position_um[steady])[0]) for one in flown]),
         "converged_s": None if None in converged else _mean([value for value in converged if value is not None]),
-        "observer_um_s": _mean([_rms(flight.flow_miss_um_s[steady]) for flight in flown]),
-        "progress": _mean([flight.progress_s[-1] / flight.time_s[-1] for flight in flown]),
-        "demand_um_s": max(float(np.hypot(*flight.demand_um_s.T).max()) for flight in flown),
+        "observer_um_s": _mean([_rms(one.flow_miss_um_s[steady]) for one in flown]),
+        "progress": _mean([one.progress_s[-1] / one.time_s[-1] for one in flown]),
+        "demand_um_s": max(float(np.hypot(*one.demand_um_s.T).max()) for one in flown),
     }
 
 

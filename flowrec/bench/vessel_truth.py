@@ -52,6 +52,12 @@ def read_true_velocity(path: Path) -> NDArray[np.float64]:
     return (_at_centres(path) if _holds_means(path) else _velocity(path, _MEANS)) * 1e6
 
 
+def read_true_pressure(path: Path) -> NDArray[np.float64] | None:
+    """The true pressure (h, w) in Pa, for scoring alone; None where the case does not have it."""
+    with np.load(path, allow_pickle=False) as case:
+        return np.asarray(case["p"], np.float64) if "p" in case.files else None
+
+
 def _at_centres(path: Path) -> NDArray[np.float64]:
     """Values at the pixel centres where vx, vy are means over a pixel, and vx_c, vy_c over half of its width.
 

@@ -20,11 +20,21 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, choose_names, mean_with_interval, paired_ratio, print_rows, stated_over_true
+from flowrec.bench.harness import (
+    Results,
+    choose_names,
+    code_version,
+    cut_torn_end,
+    kept_lines,
+    mean_with_interval,
+    paired_ratio,
+    print_rows,
+    stated_over_true,
+)
 from flowrec.bench.null_models import NULL_MODELS
 from flowrec.bench.second_worlds import SECOND_WORLDS
 from flowrec.bench.world_flights import WORLDS, Flight, FlightCase, as_line, fly, refine
-from flowrec.core import UsageError, append_line, pool, progress, provenance, replace_content, say
+from flowrec.core import UsageError, append_line, pool, progress, say
 from flowrec.stages import REFINERS
 from flowrec.verbs import SetTexts
 
@@ -72,7 +82,7 @@ def measure(
         for chip in (["second"] if world in SECOND_WORLDS else chips.split(","))
     ]
     flights = {} if rows is None else {flight.key(): flight for flight in read_flights(rows)}
-    code = _code()
+    code = code_version()
     if others := {flight.code or "another one" for flight in flights.values()} - {code}:
         say(f"{rows}: flown by {', '.join(sorted(others))}, this is {code}; another file has only flights of one")
     left = [case for case in cases if _is_left(flights.get(case.key()), wanted, again=again)]
@@ -82,7 +92,7 @@ def measure(
     with ExitStack() as stack:
         done = stack.enter_context(progress("flying", len(left), "missions"))
         if rows is not None:
-            _cut_torn_end(rows)
+            cut_torn_end(rows)
         for count, flight in enumerate(_each(work, [(case, flights.get(case.key())) for case in left], jobs), 1):
             flight.code = flight.code or code
             flights[flight.key()] = flight
@@ -92,31 +102,13 @@ def measure(
     return results_of([flights[case.key()] for case in cases], names, wanted)
 
 
-def _code() -> str:
-    """The version and the commit of this flowrec."""
-    facts = provenance(anonymous=True)
-    changed = " with local changes" if facts.get("git_changed") == "True" else ""
-    return f"flowrec {facts['flowrec']} {facts.get('git_commit', '')[:10]}{changed}"
-
-
 def read_flights(path: Path) -> Iterator[Flight]:
     """The flights of a file; a line that was cut short at its end is left out. Later lines replace earlier ones."""
-    if not path.exists():
-        return
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    for number, line in enumerate(lines, 1):
-        if number == len(lines) and not line.endswith("\n"):
-            break
+    for number, line in enumerate(kept_lines(path), 1):
         try:
             yield Flight.of(json.loads(line))
         except (ValueError, TypeError, KeyError) as error:
             raise UsageError(f"{path}, line {number}: is no flight of bench worlds; name another file") from error
-
-
-def _cut_torn_end(path: Path) -> None:
-    """Cut off a last line that has no end."""
-    if path.exists() and not (data := path.read_bytes()).endswith(b"\n"):
-        replace_content(path, data[: data.rfind(b"\n") + 1])
 
 
 def _is_left(flight: Flight | None, methods: Iterable[str], *, again: bool) -> bool:

@@ -93,6 +93,10 @@ class NetworkSettings:
     patience: Iterations = 25  # iterations without a better loss before it stops
     learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3  # learning rate of Adam
     observation_weight: Weight = 0.03  # weight of the mean log-likelihood against the mean squared residual
+    # weights of the squared residuals of the equations in the sum that is minimised; 0 leaves one out, which a study of
+    # the terms needs. The balance after the network is not changed by them.
+    continuity_weight: Weight = 1.0
+    momentum_weight: Weight = 1.0  # weight of the momentum equations in that sum
     base_channels: Annotated[int, Range(1, 512)] = 16  # channels of the first level of the network with random weights
     device: Device = "cpu"  # device that trains the network
     # More than one only on idle cores: torch's threads wait actively, and on two shared cores two are ten times slower.
@@ -124,6 +128,8 @@ class FieldLoss:
         # Residuals are relative to the square of the initial field, so that weights mean the same in any case.
         size = float((inputs.velocity**2).sum() / inputs.fluid.sum()) or 1.0
         self.norm = size * float(self.physics.where.sum().clamp(min=1.0))
+        terms = (settings.continuity_weight, settings.momentum_weight, settings.momentum_weight)
+        self.terms = tensor(np.array(terms))[None, :, None, None]
         self.pixels = torch.from_numpy(case.pixels.astype(np.int64)).to(settings.device)
         self.weights, self.flow, self.noise = tensor(case.weights), tensor(case.flow), tensor(case.noise)[:, None]
         self.observed = inputs.observed
@@ -137,7 +143,7 @@ class FieldLoss:
         if self.settings.observations == "hard":
             velocity = velocity * (1.0 - self.observed) + self.measured * self.observed
         residual = self.physics.residuals(velocity, pressure) - self.truncation
-        loss = (residual**2).sum() / self.norm
+        loss = (self.terms * residual**2).sum() / self.norm
         predicted = (velocity[0].flatten(1)[:, self.pixels] * self.weights).sum(dim=-1).T
         misfit = (((predicted - self.flow) / self.noise) ** 2).sum(dim=1)
         likelihood = 0.5 * (TAIL + 2.0) * torch.log1p(misfit / TAIL).mean()

@@ -74,6 +74,9 @@ def test_the_loss_is_the_squared_residual_beyond_the_starts_and_the_likelihood_o
     assert start == pytest.approx(2.0 * 0.03 * student_t_loss(operator.misfit(assumed.velocity_um_s)), rel=1e-3)
     once, twice = (float(loss(size)[0]) - start for size in (1.0, 2.0))
     assert once > 0.0 and twice == pytest.approx(4.0 * once, rel=1e-3)
+    # A pressure alone leaves the continuity as it is.
+    assert float(loss(1.0, momentum_weight=0.0)[0]) == pytest.approx(start, rel=1e-6)
+    assert float(loss(1.0, continuity_weight=0.0)[0]) - start == pytest.approx(once, rel=1e-6)
     hard = loss(0.0, observations="hard")[2][0, :2]
     measured = inputs.observed[0, 0] > 0.0
     moved = (hard - inputs.velocity[0])[:, measured]
