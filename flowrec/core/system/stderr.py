@@ -41,6 +41,9 @@ class Outlet(io.TextIOBase):
             with _vanished_is_no_error():
                 _stderr().flush()
 
+    def close(self) -> None:
+        """Do nothing: stderr stays open. At its end, the interpreter closes what nothing is left to flush with."""
+
     def isatty(self) -> bool:
         """True if a person sees it."""
         return _stderr().isatty()
