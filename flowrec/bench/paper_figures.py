@@ -211,7 +211,7 @@ def survey(rows: Rows, figure: Figure) -> None:
         style.bare(refined)
         below = _is_narrow(figure)
         place = {"ax": refined, "orientation": "horizontal"} if below else {"ax": [seen, refined], "shrink": 0.7}
-        figure.colorbar(dots, label="mm/s", **place)  # type: ignore[arg-type]
+        figure.colorbar(dots, label="mm/s", **place)
 
 
 def sensitivity(varied: str, vessels: str, label: str, *, log: bool) -> Callable[[Rows, Figure], None]:

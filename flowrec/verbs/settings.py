@@ -86,7 +86,11 @@ def _with_words(about: str, rows: list["SettingRow"]) -> list["SettingRow"]:
     """Settings with all these words in their names, then those with them in their meaning."""
     words = about.lower().replace("_", " ").split()
     named, told = (
-        [row for row in rows if all(word in text(row).lower().replace("_", " ") for word in words)]
-        for text in (lambda row: row.key, lambda row: row.meaning)
+        [
+            row
+            for row, text in zip(rows, texts, strict=True)
+            if all(word in text.lower().replace("_", " ") for word in words)
+        ]
+        for texts in ([row.key for row in rows], [row.meaning for row in rows])
     )
     return named + [row for row in told if row not in named]
