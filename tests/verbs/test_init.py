@@ -79,8 +79,8 @@ def test_a_person_at_a_terminal_is_asked_again_after_an_answer_that_can_not_be_r
     done = init(MOVIE, um_per_px=13.0, out=tmp_path / "mine.toml")
     assert load_config(done.path).robot.radius_um == 50.0
     chip = flowrec.stages.config.load_config(done.path).chip
-    assert Path(chip.path) == tmp_path / "robot_chip.toml"
-    assert 'kind = "inlet"\nspeed_um_s = 180.0' in (tmp_path / "robot_chip.toml").read_text(encoding="utf-8")
+    assert Path(chip.path) == tmp_path / "mine_chip.toml"
+    assert 'kind = "inlet"\nspeed_um_s = 180.0' in (tmp_path / "mine_chip.toml").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow("imports a movie")

@@ -150,6 +150,11 @@ class Observed:
     usual: float = 1.0  # sizes of the effects in _STATED, over what is usual
     wall_mode: Floats | None = None  # (n, 2) see wall_bias.py; None: the walls have no bias
 
+    def __post_init__(self) -> None:
+        # A copy with another model or operator, by `replace`, must not keep what was computed with the one before.
+        if self.there.model is not self.model or self.there.operator is not self.operator:
+            object.__setattr__(self, "there", _There(self.model, self.operator))
+
     @classmethod
     def of(cls, model: FlowModel, operator: ObservationOperator, moved: Floats | None = None) -> Observed:
         """The observations of an operator, moved by (n, 2) px. Those in solid are predicted to be at rest."""

@@ -122,6 +122,17 @@ def test_the_distance_to_a_wall_is_that_of_the_chip(twin):
     assert observed.near == pytest.approx([1.0, np.exp(-1.0 / 1.25)], abs=0.05)
 
 
+def test_observations_with_another_model_have_the_error_of_that_model_and_not_of_the_one_before(twin):
+    case = twin()
+    settings = SETTINGS.assimilate
+    model = flow_model(settings, settings.model, case.chip, case.solver)
+    operator = observation_operator(flown(case), case.chip.mask, 10.0, case.assumed.wall_px)
+    observed = Observed.of(model, operator)
+    before = observed.there.local_error
+    less_known = replace(observed, model=replace(model, error_std=3.0 * model.error_std))
+    assert np.allclose(less_known.there.local_error, 9.0 * before, rtol=1e-12)
+
+
 def test_a_stage_that_shakes_is_found_and_the_flow_is_that_without_it(twin):
     case = twin()
     observed = flown(case)
