@@ -33,7 +33,7 @@ def test_the_help_of_a_bench_has_its_summary_and_the_options_of_its_measure(name
     shown = " ".join(done.output.split())
     assert BENCHES[name].split(":")[0] in shown and "--json" in shown and "--overwrite" in shown
     module = import_module(f"flowrec.bench.{name}")
-    renamed = {"k", "tree-channels", "tree-iterations", "sets"}  # declared with names of their own
+    renamed = {"folder", "k", "tree-channels", "tree-iterations", "sets"}  # declared with names of their own
     assert all(f"--{option}" in shown for option in options_of(module.measure) - renamed)
 
 
