@@ -84,6 +84,12 @@ class Recovered:
         """True if nothing was lost."""
         return not self.lost
 
+    @property
+    def summary(self) -> str:
+        """Length of what was recovered, and the loss, as text."""
+        lost = f"; lost: {self.lost}" if self.lost else ""
+        return f"{self.ticks} ticks, {self.duration_s:.1f} s{lost}" if self.changed else "is whole; nothing to do"
+
 
 def recover(path: Path, out: Path | None = None) -> Recovered:
     """Write everything intact of a session to a new file.

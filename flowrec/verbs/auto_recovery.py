@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flowrec.core import PREFIX, BoundedProcess, FlowrecError, is_growing, remove_idle, say, try_lock, warn
-from flowrec.store import PARTIAL_SUFFIX, SESSION_SUFFIX, Recovered, recover
+from flowrec.store import PARTIAL_SUFFIX, SESSION_SUFFIX, recover
 
 _UNFINISHED = SESSION_SUFFIX + PARTIAL_SUFFIX
 _DRAFT = ".recovering" + _UNFINISHED
@@ -67,8 +67,8 @@ def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> 
             except FlowrecError as error:
                 warn(f"left from a run that did not finish: {error}")
             else:
-                recovered[done.path] = summary = _summary(done)
-                say(f"recovered {done.path} from a run that did not finish: {summary}")
+                recovered[done.path] = done.summary
+                say(f"recovered {done.path} from a run that did not finish: {done.summary}")
         _remove_drafts(folder)
     for path in postponed[:_NAMED]:
         warn(
@@ -78,11 +78,6 @@ def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> 
     if len(postponed) > _NAMED:
         warn(f"{len(postponed) - _NAMED} more like it in {folder}; flowrec ls {folder} names them")
     return recovered
-
-
-def _summary(done: Recovered) -> str:
-    lost = f"; lost: {done.lost}" if done.lost else ""
-    return f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}"
 
 
 def _remove_drafts(folder: Path) -> None:

@@ -20,7 +20,7 @@ def _recover_told(_asked: Asked, saved: "list[Recovered]") -> Told:
     return Told(
         lambda: [asdict(done) | {"path": str(done.path)} for done in saved],
         exit_status=0 if all(done.complete for done in saved) else 3,
-        remarks=lambda: [f"{done.path}: {_summary(done)}" for done in saved],
+        remarks=lambda: [f"{done.path}: {done.summary}" for done in saved],
     )
 
 
@@ -48,8 +48,3 @@ def recover(
     for left in remove_leftovers(on_this_machine(session, "nothing is recovered from").absolute().parent):
         say(f"{left}: removed, a killed process has left it")
     return recover_run(session, out)
-
-
-def _summary(done: "Recovered") -> str:
-    lost = f"; lost: {done.lost}" if done.lost else ""
-    return f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}" if done.changed else "is whole; nothing to do"

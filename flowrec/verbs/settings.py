@@ -85,12 +85,9 @@ def settings(
 def _with_words(about: str, rows: list["SettingRow"]) -> list["SettingRow"]:
     """Settings with all these words in their names, then those with them in their meaning."""
     words = about.lower().replace("_", " ").split()
-    named, told = (
-        [
-            row
-            for row, text in zip(rows, texts, strict=True)
-            if all(word in text.lower().replace("_", " ") for word in words)
-        ]
-        for texts in ([row.key for row in rows], [row.meaning for row in rows])
-    )
-    return named + [row for row in told if row not in named]
+
+    def has_words(text: str) -> bool:
+        return all(word in text.lower().replace("_", " ") for word in words)
+
+    named = [row for row in rows if has_words(row.key)]
+    return named + [row for row in rows if row not in named and has_words(row.meaning)]

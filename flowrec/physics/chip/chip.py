@@ -90,9 +90,14 @@ class Chip:
         return bool(self.mask[1:-1, 1:-1].all())
 
     @property
+    def is_driven(self) -> bool:
+        """True where an opening drives the fluid."""
+        return any(opening.value for opening in self.openings)
+
+    @property
     def is_still(self) -> bool:
         """True where nobody asks for a flow: an open field whose openings drive nothing."""
-        return not any(opening.value for opening in self.openings) and self.is_open_field
+        return not self.is_driven and self.is_open_field
 
     @property
     def boundary_values(self) -> Floats:

@@ -42,7 +42,7 @@ class FlowSolver:
             If the openings can not carry a flow, or convection does not converge.
         """
         self._check(chip)
-        if any(opening.value for opening in chip.openings):
+        if chip.is_driven:
             equations, scales, flux = self._steady(chip)
             load = equations.residual(flux, scales.drive, scales.inertia)
             residual = equations.unbalanced_fraction(flux, load)
