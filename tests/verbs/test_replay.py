@@ -238,6 +238,9 @@ def test_another_observer_changes_estimates_and_leaves_tracks(session: Path, com
     assert computed == ["survey_route", "refine", "route"]  # all of which read something else now
     assert done.comparison.topics["/robot/track"].different == 0
     assert done.comparison.topics["/robot/estimate"].different > 0
+    counted = {key: (was, now) for key, was, now in done.before_after}["observations"]
+    was, now = (len(tick.observations.position_um) for tick in (done.recorded, done.replayed))  # type: ignore[union-attr]
+    assert counted == (was, now) and was != now  # each counts its own
 
 
 @pytest.mark.slow("flies a survey, refines and plans")
