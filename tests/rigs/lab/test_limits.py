@@ -16,8 +16,8 @@ from flowrec.core.messages import Currents
 from flowrec.physics.robot import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
-from flowrec.rigs.lab.amplifiers.ni_process import Waveform
 from flowrec.rigs.lab.amplifiers.serial_protocol import field_line
+from flowrec.rigs.lab.amplifiers.waveform import Waveform
 from flowrec.stages.control.amplifier import AmplifierSettings
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.control.field_rotation import FieldCommand

@@ -18,72 +18,15 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import NS_PER_S, DeviceClock, Fit, FlowrecError, Priority, RigError, prioritise_process, seconds
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.amplifiers.ni import NiSettings, Played
 from flowrec.rigs.lab.amplifiers.ni_device import NiDevice, reason
-from flowrec.stages import FieldCommand, FieldState, MotionSegment, field_motion
-
-
-@dataclass(frozen=True, slots=True)
-class Block:
-    """Samples at a constant command.
-
-    Attributes
-    ----------
-    currents_a : (n + 1, 3) at the samples, and at the first one of the next block.
-    voltages_v : (n, 3) held from sample to sample.
-    segments : how the robot travels meanwhile; amplitude_mt : of the field in the middle.
-    """
-
-    currents_a: NDArray[np.float64]
-    voltages_v: NDArray[np.float64]
-    segments: tuple[MotionSegment, ...]
-    amplitude_mt: float
-
-
-class Waveform:
-    """The field as samples. Its phase is accumulated, so a command changes the frequency but never the phase.
-
-    Parameters
-    ----------
-    limits : every block is checked by them.
-    output_hz : sample rate as the device has it, which may differ from the one asked for.
-    """
-
-    def __init__(self, limits: CommandLimits, output_hz: float) -> None:
-        coils = limits.coils
-        self._coils = replace(coils, amplifier=replace(coils.amplifier, output_hz=output_hz))
-        self._limits = limits
-        self._state = FieldState()
-
-    @property
-    def amplitude_mt(self) -> float:
-        """Amplitude at the end of the last block."""
-        return self._state.amplitude_mt
-
-    def block(self, command: FieldCommand, count: int) -> Block:
-        """The next samples.
-
-        Raises
-        ------
-        RigError : a sample is beyond a limit; none of the block may be put out.
-        """
-        duration_s = count / self._coils.amplifier.output_hz
-        motion = field_motion(self._state, command)
-        currents, voltages = self._coils.output_samples(self._state, command, count)
-        self._limits.check_samples(currents, voltages)
-        block = Block(currents, voltages, motion.segments(duration_s), float(motion.amplitude(0.5 * duration_s)))
-        self._state = motion.after(duration_s)
-        return block
-
+from flowrec.rigs.lab.amplifiers.waveform import Waveform
+from flowrec.stages import FieldCommand
 
 BLOCK_S = 0.05
 BLOCKS_AHEAD = 2
