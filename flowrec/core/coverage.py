@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-_MEGABYTE = 1e6
+_MEGABYTE = 1e6  # bytes
 _SIGINT_STATUS = 130  # 128 + the number of SIGINT, as shells count it
 
 

@@ -45,7 +45,7 @@ from flowrec.stages import (
 LEAST_EXPLAINED = 0.65
 UNEXPLAINED = "is it the log of another run, or does the track follow another particle"  # where no more is known
 LEAST_EXPLAINED_WITH_RATE = 0.75  # a rate that differs from 1 gives the log of another run one more way to fit
-LARGEST_P_VALUE = 0.01
+LARGEST_P_VALUE = 0.01  # of the best offset in time against the null: above it none was found
 LEAST_FRAMES = 30
 _SEARCHED_FRAMES = 1800
 _REFINED = 6  # places that are refined

@@ -19,7 +19,7 @@ from .control.motion_axes import (
     MotionOfRun as MotionOfRun, MotionVerdict as MotionVerdict, contradiction as contradiction,
     orientation_by_motion as orientation_by_motion, own_gain as own_gain,
 )
-from .estimation.consistency_monitor import HealthMonitor as HealthMonitor
+from .estimation.consistency_monitor import EXPECTED_NIS as EXPECTED_NIS, HealthMonitor as HealthMonitor
 from .estimation.kalman import Kalman as Kalman, memory_s as memory_s
 from .estimation.luenberger import Luenberger as Luenberger
 from .estimation.observer import OBSERVERS as OBSERVERS, Observer as Observer

@@ -44,8 +44,8 @@ _CONFIRM_S = 0.25
 _CONFIGURE_S = 2.0
 _SILENT_S = 0.4  # a board that answers no command for so long does not answer
 _LEAST_S = 0.008  # between two lines: a line and its answer take that long at 115200 baud
-_TURNS = 1e-6
-_WRAP = 1 << 32
+_TURNS = 1e-6  # the controller counts millionths of a revolution
+_WRAP = 1 << 32  # its counters have 32 bits
 
 
 class SerialAmplifier:
