@@ -30,7 +30,7 @@ Turns = Callable[[Floats], Floats]
 
 _STEPS = 15  # of the least squares, at most
 _REWEIGHTINGS = 3  # for each of them
-_LARGEST_STEP_S = 0.1
+_LARGEST_STEP_S = 0.1  # of the offset, in one step of Gauss-Newton
 _CONVERGED_S = 1e-5
 _DIFFERENCE_S = 2e-3  # of the central difference of the turns
 _BLOCK_S = 3.0

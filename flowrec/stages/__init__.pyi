@@ -59,7 +59,6 @@ from .refine.network_inputs import LEAST_SPEED as LEAST_SPEED, LOG_STD as LOG_ST
 from .refine.observation_operator import (
     ObservationOperator as ObservationOperator, observation_operator as observation_operator,
 )
-from .refine.network_fit import Device as Device
 from .refine.pi_unet import PiUnet as PiUnet
 from .refine.refiner import REFINERS as REFINERS, Refiner as Refiner, keep_flow as keep_flow
 from .refine.residuals import Physics as Physics

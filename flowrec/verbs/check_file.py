@@ -42,7 +42,7 @@ from flowrec.verbs.verdict import (
 )
 
 _LISTED = 4  # gaps, kinds of numbers and settings of a clock that are named one by one
-_CLOCK_JUMP_S = 1.0
+_CLOCK_JUMP_S = 1.0  # of the wall clock against the monotonic one: more than any drift in a run
 HEAD = ("configuration", "chip", "provenance", "outcome")
 _CLOCKS = ("wall_ns", "monotonic_ns")
 EXACT = "yes: configuration, chip, and the inputs of every tick"

@@ -54,9 +54,9 @@ _LOSS_WARNING, _LOSS_FAILURE = 0.001, 0.05  # fraction of the blocks
 _DARK = 0.1  # of the full scale
 _TRIAL_BYTES = 128 << 20
 _HEADROOM = 2.0  # of the disk's speed over the rate of a run
-_LEAST_MINUTES = 10.0
+_LEAST_MINUTES = 10.0  # of a run, for which the disk has to have room
 _SILENT_S = 0.3  # longer than lab.guardian_s
-_OLD_DAYS = 90.0
+_OLD_DAYS = 90.0  # since the file of the configuration was changed, after which it may not fit any more
 _SEES_ALL = 1.02  # of a side of the view: a chip that is larger is not seen whole
 # By how much the encodings compress the images of a camera at least; frame_encodings.py has the measurements.
 _PACKED = {"raw": 1.0, "zstd": 1.3, "delta": 1.8, "png": 1.8, "jpeg": 6.0}

@@ -122,7 +122,7 @@ class StateLogger:
 
 
 _JPEG_QUALITY = 85  # 0 to 100, of OpenCV's encoder
-_TRAIL_STEP_PX = 1.0
+_TRAIL_STEP_PX = 1.0  # of NOMINAL_PX, between two points of the robot's trail
 _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 _SHOWN = (  # fields of a tick, in the order in which they are logged

@@ -12,7 +12,7 @@ from flowrec.core.diagnostics import Clocks
 from flowrec.core.units import nanoseconds, seconds
 
 _SET_S = 0.01  # a larger change of the wall clock relative to the monotonic one means that it was set
-_SIMULTANEOUS_NS = 100_000
+_SIMULTANEOUS_NS = 100_000  # between two readings of one clock, with the other clock's between them
 _ATTEMPTS = 5  # to read both clocks within that time
 _EVERY_NS = nanoseconds(1.0)  # between the messages on the session clock
 _COUNTS = 1 << 63  # largest counter that a message can hold

@@ -31,7 +31,7 @@ _BORDER_PX = 4  # pixels nearer to the border would leave the image with most sh
 _LEAST_GRADIENT = 4.5  # of a pixel that is used, in standard deviations: one in 25,000 has it by noise alone
 # Variance of a gradient by Scharr's operator (cv2.Scharr / 32) for a pixel's noise of variance 1.
 _GRADIENT_NOISE = 236.0 / 1024.0
-_LEAST_PIXELS = 60
+_LEAST_PIXELS = 60  # with fewer no shift is measured
 _LEAST_STRUCTURE = 4.0  # mean squared gradient along a direction, in units of that of noise alone
 _WALL_PX = 2.0  # half the width of the image of a wall: farther in the fluid there are bodies that move
 _ITERATIONS = 8  # at most, of the reweighted fit
