@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -14,6 +15,11 @@ QUESTION = re.compile(r"(Why|What|Of|The same|How|Whether|Where|When|Which|Who|W
 PARTICIPLE = re.compile(
     r"(?!.*(need|feed|speed|seed|embed|exceed)$)([a-z]+ed|begun|bound|broken|built|chosen|done|drawn|driven|flown|found|given|gone"
     r"|grown|heard|held|hidden|kept|known|left|lost|made|met|said|seen|sent|shown|stuck|swept|taken|thrown|told|woken|worn|written)"
+)
+# Ends of names that state a unit, or what is counted.
+UNIT = re.compile(
+    r"(?i).*_((um|mm|m|in|px|ns|us|ms|s|days|minutes|hz|rad|deg|mt|pa|mpa_s|kg_m3|m_s|um_s|j_k|bytes|gb|mb|bits)"
+    r"|(characters|files|frames|lines|pages|pixels|rows|threads|ticks))"
 )
 LONG = "Long because"  # begins the sentence that gives the reason
 
@@ -83,3 +89,51 @@ def test_no_function_is_named_by_a_bare_participle() -> None:
     assert [each for each in found if not each.startswith(tuple(PARTICIPLES))] == []
     unused = [place for place in PARTICIPLES if not any(each.startswith(place) for each in found)]
     assert unused == [], "take it from the list"
+
+
+def is_number(value: ast.expr) -> bool:
+    """Whether an expression is a number, a tuple of numbers, or computed from numbers alone."""
+    match value:
+        case ast.Constant():
+            return isinstance(value.value, int | float) and not isinstance(value.value, bool)
+        case ast.UnaryOp():
+            return is_number(value.operand)
+        case ast.BinOp():
+            return is_number(value.left) and is_number(value.right)
+        case ast.Tuple():
+            return bool(value.elts) and all(map(is_number, value.elts))
+    return False
+
+
+def unexplained_numbers(module: ast.Module, lines: list[str]) -> Iterator[str]:
+    """Names of a module's numbers without a unit and without a comment, behind them or above their paragraph."""
+    end, explained = 0, False  # of the assignment above
+    for node in module.body:
+        match node:
+            case ast.Assign(targets=[target], value=value) | ast.AnnAssign(target=target, value=ast.expr() as value):
+                names = [each.id for each in ast.walk(target) if isinstance(each, ast.Name)]
+            case _:
+                continue
+        first, last = node.lineno, node.end_lineno or node.lineno
+        explained = lines[first - 2][:1] == "#" or (explained and first == end + 1)
+        end = last
+        if is_number(value) and not explained and not any("#" in line for line in lines[first - 1 : last]):
+            yield from (name for name in names if not UNIT.fullmatch(name))
+
+
+def test_each_number_of_a_module_states_its_unit_or_its_reason() -> None:
+    found = [
+        f"{file}: {name}"
+        for file, node in definitions()
+        if isinstance(node, ast.Module)
+        for name in unexplained_numbers(node, (PACKAGE / file).read_text(encoding="utf-8").split("\n"))
+    ]
+    assert found == [], "say in a comment where the number comes from"
+
+
+def test_a_number_is_explained_by_its_name_or_the_comment_of_its_paragraph() -> None:
+    def names(source: str) -> list[str]:
+        return list(unexplained_numbers(ast.parse(source), source.split("\n")))
+
+    assert names("# Limits.\nA = 1\nB = 2\n\nLEAST_UM = 3.0\nD = 4  # of five\nE = F\n") == []
+    assert names("# Limits.\nA = 1\n\nB = -2.0\nC: int = 1 << 3\nD, E_S = 1, 2\n") == ["B", "C", "D"]

@@ -22,7 +22,7 @@ OBSERVED = "#0a8f9c"
 SPEEDS, ERRORS = "viridis", "magma_r"  # perceptually uniform, distinguishable with colour blindness
 BLOCK_PX = 11  # one arrow per block of pixels, where the channel is widest
 SHORTEST = 0.12  # least speed of an arrow, over the largest one
-COLUMN_IN, ROW_IN, STRIP_IN = 1.8, 2.1, 2.3
+COLUMN_IN, ROW_IN, STRIP_IN = 1.8, 2.1, 2.3  # inches, of a column, of a row and of the strip below
 _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 

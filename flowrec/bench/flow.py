@@ -47,7 +47,7 @@ from flowrec.core import (
 from flowrec.physics import FlowSolver, clear_cache, read_vessel_case, relative_rmse
 from flowrec.stages import REFINERS, Device, PiUnet, Refiner, Trimmed, with_row
 
-RANDOM_CASES = 10
+RANDOM_CASES = 10  # vessels that are made up where no folder of cases is given
 
 # The rows of REFINERS, of which fvm, no refinement, and gain are null models, and those of null_models.py. As in the
 # paper, pi_unet starts from the solver's field. `:printed` has random weights and no other optimiser than the paper's.

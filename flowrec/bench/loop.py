@@ -28,7 +28,7 @@ from flowrec.verbs import Change, prepare, replay_session
 from flowrec.view import LiveView
 
 RATE_HZ = 60.0
-ROUNDS = 2
+ROUNDS = 2  # of all kinds of runs, one after the other: what drifts in the machine meets each kind
 KINDS = ("plain", "recording", "viewing", "recording and viewing")
 
 

@@ -20,13 +20,13 @@ import numpy as np
 import scipy  # its linalg, ndimage and sparse load at first use
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, FlowError, FlowField, Observations
+from flowrec.core import STD_PER_MAD, Floats, FlowError, FlowField, Observations
 from flowrec.physics import Chip, FlowSolver, border, fluid_image, sample
 
 INLET_SHARE, OUTLET_SHARE = 0.25, 0.1  # prior std of inlet speeds, and of outlet pressures over the pressure drop
 GAIN, OFFSET_PX = 0.1, 0.3  # prior std of the robot's own motion per revolution, and of the image's offset
 LEFT_SHARE = {"modes": 0.03, "network": 0.05}  # of the speed: what the model can not represent
-HUBER, ITERATIONS = 2.0, 6
+HUBER, ITERATIONS = 2.0, 6  # limit of a residual in standard deviations, and rounds of reweighting
 LENGTHS_PX, SIZES, GAINS = (3.0, 6.0, 12.0, 24.0, 48.0), (0.03, 0.1, 0.2, 0.4), (0.0, 0.1)  # of the grid of gp
 
 
@@ -158,7 +158,7 @@ def _robust_fit(
         covariance = np.linalg.inv(np.eye(design.shape[1]) + design.T @ (scaled[:, None] * design))
         z = covariance @ (design.T @ (scaled * y))
         residual = np.abs(y - design @ z) / noise
-        factor = max(1.0, 1.4826 * float(np.median(residual)))
+        factor = max(1.0, STD_PER_MAD * float(np.median(residual)))
         weight = np.minimum(1.0, HUBER * factor / np.maximum(residual, 1e-9))
     return z, covariance, factor
 

@@ -24,9 +24,9 @@ from flowrec.stages import OBSERVERS, HealthMonitor, Kalman, Luenberger, Observe
 from flowrec.store import Session
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
-LAPS = 2
+LAPS = 2  # of the lemniscate
 GAINS_PER_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # tried of the Luenberger observer; that of the paper is 1
-MAP_SCALE = 1.1
+MAP_SCALE = 1.1  # of the map over the true flow: a tenth too fast
 PULSATION_HZ = 1.0
 DRAWN = "10 um"
 

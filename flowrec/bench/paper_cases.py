@@ -33,7 +33,7 @@ from flowrec.physics import sample
 from flowrec.stages import PLANNERS, PiUnet, Refiner
 
 FIRST_SEED = 1000  # worlds, vessels and networks from here on are for figures only
-SIDE_PX, TREE_ITERATIONS = 256, 20_000
+SIDE_PX, TREE_ITERATIONS = 256, 20_000  # of the chips of random worlds; nodes tried by RRT*
 TRACE_POINTS, TRACED_SEED = 160, 0  # of the curves that the rows of the first seed carry, to be drawn
 
 # The paper's robot takes its observations while it is carried through the whole chip, and they are trimmed.

@@ -35,8 +35,8 @@ from flowrec.stages import (
     resolve,
 )
 
-RANDOM_CASES = 20
-_MOST_STRETCHES = 60
+RANDOM_CASES = 20  # made up where no folder of cases is given
+_MOST_STRETCHES = 60  # of a way, after which a survey that has not seen enough is ended
 Points = NDArray[np.float64]
 
 

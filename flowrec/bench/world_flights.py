@@ -80,7 +80,7 @@ WORLDS: Mapping[str, Callable[[Given], Sequence[str]]] = {
     "shake": lambda given: (f"shake_um={given.config.camera.um_per_px}", "shake_hz=3.0"),
     "optics": lambda _: ("optics=oblique",),
 }
-_FAULT_STREAM = 0xFA017
+_FAULT_STREAM = 0xFA017  # of the random numbers: faults are drawn apart from the world, which they leave unchanged
 
 
 @dataclass(frozen=True, slots=True)

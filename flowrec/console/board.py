@@ -17,8 +17,8 @@ from flowrec.console.console import CommandReply, RunEnded
 from flowrec.console.page_state import Drawing, PageState
 from flowrec.view import Batch, Scene
 
-MOST_PAGES = 8
-_MOST_EVENTS = 100
+MOST_PAGES = 8  # open at a time; a further one is refused
+_MOST_EVENTS = 100  # the last ones, for pages that open later
 
 
 class PageContents(NamedTuple):

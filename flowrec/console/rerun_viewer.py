@@ -24,7 +24,7 @@ from flowrec.view import viewer
 _PARTS = {"re_viewer.js": "text/javascript", "re_viewer_bg.wasm": "application/wasm"}
 _SERVICE = "/rerun.sdk_comms.v1alpha1.MessageProxyService/"  # of Rerun 0.41; its methods that only read:
 _METHODS = frozenset({"ReadMessages", "ReadTables", "Version"})
-_MOST_STREAMS = 4
+_MOST_STREAMS = 4  # of Rerun's data at a time; a further one is refused
 _START_S = 20.0
 _CHUNK_BYTES = 65536
 _LONGEST_REQUEST_BYTES = 65536

@@ -112,7 +112,8 @@ from .topics import (
     Extra as Extra, NO_EXTRA as NO_EXTRA, TOPICS as TOPICS, Tick as Tick, WORKER_FIELDS as WORKER_FIELDS, stale_results as stale_results,
 )
 from .units import (
-    M_PER_UM as M_PER_UM, MM_PER_UM as MM_PER_UM, NS_PER_S as NS_PER_S, PA_S_PER_MPA_S as PA_S_PER_MPA_S, UM_PER_M as UM_PER_M,
+    HALF_PX as HALF_PX, M_PER_UM as M_PER_UM, MM_PER_UM as MM_PER_UM, NS_PER_S as NS_PER_S, PA_S_PER_MPA_S as PA_S_PER_MPA_S,
+    STD_PER_MAD as STD_PER_MAD, TUKEY as TUKEY, UM_PER_M as UM_PER_M, Z95 as Z95,
     amounts as amounts, nanoseconds as nanoseconds, seconds as seconds, unit_of as unit_of,
     unit_suffix as unit_suffix, wrap_rad as wrap_rad,
 )

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-_MEGABYTE = 1e6
+_MEGABYTE = 1e6  # bytes
 _SIGINT_STATUS = 130  # 128 + the number of SIGINT, as shells count it
 
 
@@ -41,7 +41,7 @@ class Coverage:
 
     @property
     def whole(self) -> bool:
-        """True if all that there is was looked at; what `left_out` names was never there to look at, or not asked."""
+        """True if all data was looked at. What `left_out` names does not count: it was absent, or was not asked for."""
         return not self.stopped and not self.part and self.done >= self.total
 
     @property
@@ -61,7 +61,7 @@ class Coverage:
         return f"stopped after {self.amount} ({self.stopped})" if self.stopped else self.amount
 
     def sentence(self, found: str) -> str:
-        """The amount with the result, which is never said of more than was looked at: "1934 of 1934 ticks: identical".
+        """The amount with the result, stated of the part that was looked at alone: "1934 of 1934 ticks: identical".
 
         Parameters
         ----------

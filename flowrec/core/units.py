@@ -1,6 +1,7 @@
-"""Conversion factors between units. The unit is part of every name (`_um`, `_um_s`, `_pa`).
+"""Conversion factors between units, and constants of statistics.
 
-Only the flow solver works in SI; everything else uses um, um/s, s, rad, Hz, mT, Pa, mPa*s, kg/m3, A.
+The unit is part of every name (`_um`, `_um_s`, `_pa`). Only the flow solver works in SI; everything else uses um, um/s,
+s, rad, Hz, mT, Pa, mPa*s, kg/m3, A.
 """
 
 import math
@@ -10,7 +11,12 @@ NS_PER_S = 1_000_000_000
 M_PER_UM = 1e-6
 MM_PER_UM = 1e-3
 UM_PER_M = 1e6
+HALF_PX = 0.5  # from the corner of a pixel, where viewers have their origin, to its centre, where flowrec has it
 PA_S_PER_MPA_S = 1e-3
+# Of the normal distribution, in standard deviations.
+Z95 = 1.959964  # half of the interval that holds 95 %
+STD_PER_MAD = 1.4826  # standard deviation over the median of the absolute value
+TUKEY = 4.685  # residual from which on Tukey's weight is 0: an estimate with 95 % efficiency
 # Units on the command line.
 _PER = {
     "s": {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},

@@ -19,7 +19,7 @@ from flowrec.exports.formats import TimeProgress
 from flowrec.movies import NAMESPACE, MovieNotes
 from flowrec.store import Session
 
-_BIG_BYTES = 3_900_000_000  # of pixels; a plain TIFF ends at 4 GiB, and headers and the text are in it, too
+_BIG_BYTES = 3_900_000_000  # of pixels; a plain TIFF holds 4 GiB, of which headers and the text need some
 _LEVEL = 3  # of Deflate
 
 

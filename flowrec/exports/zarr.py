@@ -23,7 +23,7 @@ from flowrec.exports.formats import TimeProgress
 from flowrec.store import Session, columns_of
 
 _CHUNK_BYTES = 8 << 20
-_FORMAT = 2
+_FORMAT = 2  # of Zarr, which older readers have too
 _LEVEL = 1  # of zstd: camera noise does not become smaller with more
 _DIMENSIONS = "_ARRAY_DIMENSIONS"  # where xarray looks for the names of the dimensions
 _EPOCH = "nanoseconds since 1970-01-01T00:00:00"

@@ -12,7 +12,7 @@ from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outp
 from flowrec.rigs import sha256_of
 from flowrec.stages import Coils
 
-_EXACT_DIGITS = 9
+_EXACT_DIGITS = 9  # decimals from which on a value counts as exact
 
 
 class CoilProposal(NamedTuple):

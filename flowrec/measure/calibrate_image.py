@@ -18,7 +18,7 @@ from flowrec.stages import CameraSettings, Config
 
 _ABOUT = 1.12  # camera.um_per_px, where it is given, is right up to this factor
 _UNKNOWN = 2.0  # the same of the scale at which the chip fills the image
-_STALE_DAYS = 30.0
+_STALE_DAYS = 30.0  # after which a registration is said to be old
 _POOR_PX = 1.0  # residual
 _ADVICE = "flowrec calibrate image PICTURE -o registration.toml measures it"
 _MOVED_PX = 1.0  # of the walls; a hundred times the error of a fit to good pictures, ten times that to poor ones

@@ -9,7 +9,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flowrec.core import NS_PER_S, Coverage, Currents, FlowField, Ints, UsageError, __version__, say, seconds, table
+from flowrec.core import (
+    NS_PER_S,
+    Z95,
+    Coverage,
+    Currents,
+    FlowField,
+    Ints,
+    UsageError,
+    __version__,
+    say,
+    seconds,
+    table,
+)
 from flowrec.measure.motion_fit import LEAST_EXPLAINED_WITH_RATE, LEAST_FRAMES, MotionFit, fit_motion, refusal_of
 from flowrec.measure.motion_regression import Turns
 from flowrec.measure.motion_search import SearchRange
@@ -20,8 +32,7 @@ from flowrec.store import Session, files_behind
 # A log on another clock: any offset, and rates of 30 % to either side.
 ANYWHERE = SearchRange(least_rate=0.7, largest_rate=1.0 / 0.7)
 _ONE_CLOCK = SearchRange(-2.0, 2.0)  # from command to motion
-_Z95 = 1.96
-_SIGNIFICANT = 3.0
+_SIGNIFICANT = 3.0  # standard errors from which on an angle is stated as wrong
 _LEAST_RAD = math.radians(2.0)  # by which the axes of the heading differ at least before a setting is proposed
 # Times the interval of the images by which rows of a log are too far apart for quick commands; ratio of the intervals
 # up to which its rows are samples, and the least number of them.
@@ -242,7 +253,7 @@ def _propose_settings(
     config, advice = session.config, []
     sets: dict[str, float | bool] = {"robot.um_per_rev": float(f"{fit.um_per_rev:.4g}")}
     stated = config.robot.um_per_rev
-    if abs(fit.um_per_rev - stated) > _Z95 * fit.um_per_rev_std:
+    if abs(fit.um_per_rev - stated) > Z95 * fit.um_per_rev_std:
         advice.append(
             f"{fit.um_per_rev:.4g} um per revolution differ from robot.um_per_rev = {stated:g} by "
             f"{100.0 * (fit.um_per_rev / stated - 1.0):+.1f} %, more than the error allows"
@@ -252,12 +263,12 @@ def _propose_settings(
     if shared_clock:
         delay_s = -fit.offset_s
         sets["robot.delay_s"] = round(max(delay_s, 0.0), 4)
-        if abs(delay_s - config.robot.delay_s) > _Z95 * fit.offset_std_s:
+        if abs(delay_s - config.robot.delay_s) > Z95 * fit.offset_std_s:
             advice.append(f"robot.delay_s = {config.robot.delay_s:g} differs from the latency by more than its error")
     else:
         movie = config.movie
         advice.append("log and movie have clocks of their own, so the offset holds the latency too")
-        if own_log and abs(fit.offset_s) > _Z95 * fit.offset_std_s:
+        if own_log and abs(fit.offset_s) > Z95 * fit.offset_std_s:
             sets["movie.clock_offset_s"] = round(movie.clock_offset_s + fit.offset_s, 4)
             advice.append("the log is not aligned: import again with --align, or with this movie.clock_offset_s")
         sets |= heading_settings(fit, movie.heading_offset_deg, movie.heading_mirrored) if own_log else {}

@@ -22,7 +22,7 @@ _GOOD_ROWS = 12
 _GOOD_SET = f"{_GOOD_ROWS} are recommended: each coil alone with both signs, then some of all three at once"
 _SIGNIFICANCE = 0.05  # probability that a calibration without a wrong row is reported to have one
 _WEAK_EXCITATION = 0.05  # fraction of the strongest direction of the currents
-_NOMINAL_MT = 4.0
+_NOMINAL_MT = 4.0  # of the field whose standard error is stated
 _DIRECTIONS = 400  # in which the uncertainty is evaluated
 
 

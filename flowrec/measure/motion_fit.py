@@ -45,9 +45,9 @@ from flowrec.stages import (
 LEAST_EXPLAINED = 0.65
 UNEXPLAINED = "is it the log of another run, or does the track follow another particle"  # where no more is known
 LEAST_EXPLAINED_WITH_RATE = 0.75  # a rate that differs from 1 gives the log of another run one more way to fit
-LARGEST_P_VALUE = 0.01
+LARGEST_P_VALUE = 0.01  # of the best offset in time against the null: above it none was found
 LEAST_FRAMES = 30
-_SEARCHED_FRAMES = 1800
+_SEARCHED_FRAMES = 1800  # of the part that moves most: where it lies in the log is searched for with these alone
 _REFINED = 6  # places that are refined
 _ROUNDS = 2  # of noise and parameters in turns
 _GATE = 8.0  # standard deviations beyond which a position is no motion of this robot
@@ -65,7 +65,7 @@ _LOG_VARIANCE = 0.03109  # of log(1 + x / FREEDOM) of normal noise, see `_explai
 _OFFSET_S = 3e-4
 _COMMAND_REVOLUTIONS = 0.03  # by which a change of the command takes effect late
 _GAIN, _GAIN_WITHOUT_FLOW = 0.02, 0.05  # relative: the flow along the way changes with the robot's own motion
-_HEADING_RAD = 0.009
+_HEADING_RAD = 0.009  # added to the standard error of the heading in quadrature: half a degree
 
 
 class MotionFit(NamedTuple):

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit  # quantile of Student's t; scipy.stats takes 0.3 s to load
 
+from flowrec.core import Z95
 from flowrec.stages import FREEDOM, Flags, Floats, NoiseModel, whiten
 
 Complex = NDArray[np.complex128]
@@ -29,13 +30,12 @@ Turns = Callable[[Floats], Floats]
 
 _STEPS = 15  # of the least squares, at most
 _REWEIGHTINGS = 3  # for each of them
-_LARGEST_STEP_S = 0.1
+_LARGEST_STEP_S = 0.1  # of the offset, in one step of Gauss-Newton
 _CONVERGED_S = 1e-5
 _DIFFERENCE_S = 2e-3  # of the central difference of the turns
 _BLOCK_S = 3.0
-_LEAST_BLOCKS, _MOST_BLOCKS = 8, 200
+_LEAST_BLOCKS, _MOST_BLOCKS = 8, 200  # of the jackknife: fewer tell no variance, more take time
 _SINGULAR = 1e-9  # relative to the whole information
-_Z95 = 1.959964
 _OFFSET, _RATE, _GAIN, _TURNED, _FLOW = range(5)
 
 
@@ -194,7 +194,7 @@ class TrackRegression:
         jackknife = D.T @ D * (count - 1.0) / count
         # If few blocks matter: the quantile of Student's t with the degrees of freedom that they leave (Satterthwaite).
         freedom = np.maximum((D**2).sum(0) ** 2 / np.maximum((D**4).sum(0), 1e-300), 1.0)
-        wider = stdtrit(freedom, 0.975) / _Z95
+        wider = stdtrit(freedom, 0.975) / Z95
         jackknife *= np.outer(wider, wider)
         # Weighted residuals have the variance of their scores; for the t distribution this is the plain estimate.
         plain = np.linalg.inv(H) * float(((W * left) ** 2).sum() / max(W.sum(), 1e-300))

@@ -21,8 +21,8 @@ from flowrec.stages import Floats, whiten
 
 _LEAST_OVERLAP = 0.5  # of the shorter of movie and log
 _RATE_STEP = 0.6  # frames by which the ends of the movie move at most between two rates of the search
-_MOST_RATES = 1500
-_NULL_RATES = 24
+_MOST_RATES = 1500  # in the search, which bounds its time for a long movie
+_NULL_RATES = 24  # of them, at which the null distribution is computed
 _CLIP = 5.0  # times the whitened motion that 90 % of the frames do not exceed
 _KEPT = 24  # candidates of each search, best first
 _TAIL = 0.1  # fraction of the chance correlations that the exponential tail is fitted to

@@ -32,7 +32,7 @@ from flowrec.physics import (
     median_width_um,
 )
 
-_CANDIDATES = 12
+_CANDIDATES = 12  # coarse poses that are fitted at most, the best first
 _LEAST_SCORE = 0.55  # of a candidate, relative to the best one
 _FIRST, _HOPELESS = 3, 0.5  # if of so many candidates none finds this part of the walls, the others are not tried
 _REACH_WIDTHS, _REACH_PX = 0.6, 6.0  # from the walls: in median channel widths, but at least so many camera pixels

@@ -20,7 +20,7 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import ChipError, Floats, Image, Ints
+from flowrec.core import STD_PER_MAD, ChipError, Floats, Image, Ints
 from flowrec.measure.images import Levels, Mask, blur_image, draw_curves, shrink
 from flowrec.measure.outline import Outline, Walls, outline_of
 from flowrec.measure.wall_lines import divisions, otsu
@@ -354,7 +354,7 @@ def _levels(light: Levels) -> tuple[Mask, float]:
         rest = values - few @ fit
         levels = float(np.median(rest[~above])), float(np.median(rest[above]))
         off = np.where(above, rest - levels[1], rest - levels[0])
-        contrast = (levels[1] - levels[0]) / max(1.4826 * float(np.median(np.abs(off))), 1e-6)
+        contrast = (levels[1] - levels[0]) / max(STD_PER_MAD * float(np.median(np.abs(off))), 1e-6)
         if contrast > best[0]:  # half-way in light, not in its logarithm
             best = contrast, fit, float(np.log(0.5 * (np.exp(levels[0]) + np.exp(levels[1]))))
     contrast, fit, threshold = best

@@ -12,18 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flowrec.core import Applied, Estimate, FlowField, Track, UsageError, seconds
+from flowrec.core import STD_PER_MAD, Applied, Estimate, FlowField, Track, UsageError, seconds
 from flowrec.physics import Robot
-from flowrec.stages import Kalman
+from flowrec.stages import EXPECTED_NIS, Kalman
 
-_EXPECTED_NIS = 2.0
 _INTERVAL_S = 0.5  # over which the drift of a parked robot is taken as quadratic
-_LEAST_INTERVALS = 3
-_LEAST_SAMPLES = 8
+_LEAST_INTERVALS = 3  # whose median is the noise
+_LEAST_SAMPLES = 8  # in an interval, of which a quadratic takes three, or third differences
 _SETTLING = 45  # frames before the filter's innovations count
-_AGILITY = (1e-3, 1e3)
+_AGILITY = (1e-3, 1e3)  # both ends of the search
 _STEPS = 8  # of the bisection of these six decades: to 6 %
-_STD_PER_MAD = 1.4826  # of a normal distribution
 
 
 class Tuned(NamedTuple):
@@ -67,7 +65,7 @@ def parked_noise(tracks: Sequence[Track], applied: Sequence[Applied]) -> tuple[f
             position = np.array([each.position_um for each in interval])
             residual = position - powers @ np.linalg.lstsq(powers, position, rcond=None)[0]
             freedom = len(interval) / (len(interval) - 3.0)
-            sigmas.append(_STD_PER_MAD * float(np.median(np.abs(residual))) * math.sqrt(freedom))
+            sigmas.append(STD_PER_MAD * float(np.median(np.abs(residual))) * math.sqrt(freedom))
             interval = []
     return (float(np.median(sigmas)) if len(sigmas) >= _LEAST_INTERVALS else math.nan), rest_s
 
@@ -85,7 +83,7 @@ def moving_noise(tracks: Sequence[Track], applied: Sequence[Applied], robot: Rob
     complete = seen[:-3] & seen[1:-2] & seen[2:-1] & seen[3:] if len(tracks) > 3 else np.zeros(0, bool)
     if np.count_nonzero(complete) < _LEAST_SAMPLES:
         return math.nan
-    return _STD_PER_MAD * float(np.median(np.abs(third[complete]))) / math.sqrt(20.0)  # 1 + 9 + 9 + 1
+    return STD_PER_MAD * float(np.median(np.abs(third[complete]))) / math.sqrt(20.0)  # 1 + 9 + 9 + 1
 
 
 def tune(
@@ -128,7 +126,7 @@ def tune(
     low, high = (math.log(end) for end in _AGILITY)
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        if mean_nis(replace(kalman, agility=math.exp(middle))) > _EXPECTED_NIS:
+        if mean_nis(replace(kalman, agility=math.exp(middle))) > EXPECTED_NIS:
             low = middle
         else:
             high = middle

@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats
+from flowrec.core import STD_PER_MAD, TUKEY, Floats
 from flowrec.measure.images import Levels, blur_image, gradient, shrink
 from flowrec.measure.wall_search import WallMap, move_chip
 from flowrec.physics import Calibration
@@ -50,7 +50,6 @@ _RELIEF_FOUND, _RELIEF_MORE = 0.9, 0.1  # part of the walls found by local contr
 _KNOTS = 12  # of f on either side of the wall
 _ALL_KNOTS = 2 * _KNOTS + 1
 _BEND = np.diff(np.eye(_ALL_KNOTS), 2, axis=0).T @ np.diff(np.eye(_ALL_KNOTS), 2, axis=0)
-_TUKEY = 4.685
 _LIKE = 0.5  # correlation of a patch's profile with f from which on the patch counts as found
 _LEAST_PIXELS = 30  # of a patch
 _LEAST_ALL = 200  # pixels of a fit
@@ -241,8 +240,8 @@ class _Model:
         b = self.gain[self._patch]
         self.offset = self._mean(self._levels - b * f)
         self._rest = self._levels - self.offset[self._patch] - b * f
-        scale = 1.4826 * float(np.median(np.abs(self._rest))) + 1e-9 if len(self._rest) else 1.0
-        self._weigh(np.maximum(1.0 - (self._rest / (_TUKEY * scale)) ** 2, 0.0) ** 2)
+        scale = STD_PER_MAD * float(np.median(np.abs(self._rest))) + 1e-9 if len(self._rest) else 1.0
+        self._weigh(np.maximum(1.0 - (self._rest / (TUKEY * scale)) ** 2, 0.0) ** 2)
 
     def _weigh(self, weight: Floats) -> None:
         self._weight = weight

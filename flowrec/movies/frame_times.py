@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flowrec.core import DATES, NS_PER_S, TIME_UNITS, MovieError, Table, read_table
 from flowrec.movies.movie import MovieFacts, whole_ns
 
-_MOST_IMAGES = 1 << 40
+_MOST_IMAGES = 1 << 40  # a larger number of an image is no number of an image, and may not fit an integer
 
 
 @dataclass(frozen=True, slots=True, eq=False)

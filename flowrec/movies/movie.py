@@ -34,7 +34,7 @@ MOVIE_READERS = Methods(
 )
 LARGEST_PX, SMALLEST_PX = 16_384, 8  # as of camera.width_px and height_px
 MOST_PIXELS = 150_000_000
-MOST_IMAGES = 20_000_000
+MOST_IMAGES = 20_000_000  # nine hours at 600 Hz; a file that declares more is damaged
 _MEDIAN_BYTES = 400_000_000  # of the images that a median is taken of
 
 

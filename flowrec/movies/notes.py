@@ -16,7 +16,7 @@ from typing import Any
 from flowrec.core import MovieError, parse_toml
 
 _KEY, _VERSION = "flowrec_movie", 1
-_MOST_CHARACTERS = 32_000_000
+_MOST_CHARACTERS = 32_000_000  # bounds the memory that a damaged note can take
 _LARGEST_NS = 1 << 62
 
 

@@ -14,7 +14,7 @@ _S_PER = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9
 _S_PER |= {"second": 1.0, "millisecond": 1e-3, "microsecond": 1e-6, "nanosecond": 1e-9, "minute": 60.0, "hour": 3600.0}
 _UM_PER = {"µm": 1.0, "μm": 1.0, "um": 1.0, "micron": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _UM_PER |= {"micrometer": 1.0, "nanometer": 1e-3, "millimeter": 1e3, "centimeter": 1e4, "meter": 1e6}
-_LIMIT_CHARACTERS = 1 << 28
+_LIMIT_CHARACTERS = 1 << 28  # bounds the memory that a damaged description can take
 NAMESPACE = "flowrec"  # of the annotation in which flowrec keeps movies/notes.py
 
 

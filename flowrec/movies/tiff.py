@@ -29,7 +29,7 @@ from flowrec.movies.notes import notes_in, refuse_drawn
 from flowrec.movies.ome import OmeFacts, annotation_in, declared_planes, ome_facts, parse_ome, um_per
 
 _LOSSY = ("JPEG", "JPEG_LOSSY", "OJPEG", "WEBP", "JPEGXR", "JPEGXL", "JPEG2000", "JETRAW")
-_MINISWHITE, _PALETTE = 0, 3
+_MINISWHITE, _PALETTE = 0, 3  # values of the tag PhotometricInterpretation in TIFF 6.0
 
 
 class TiffMovie(Movie):

@@ -11,6 +11,7 @@ import numpy as np
 from flowrec.core import Floats, FlowField, PositiveShare, Range
 
 _SIGNIFICANT = 2.0  # standard deviations
+_NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are meant for
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
 
 _Radius = Annotated[float, Range(0.05, 1e4)]
@@ -50,6 +51,11 @@ class Robot(RobotSettings):
     def speed_limit_um_s(self) -> float:
         """The fastest speed through the fluid that may be commanded, um/s."""
         return min(self.max_speed_um_s, self.step_out_margin * self.step_out_hz * self.um_per_rev)
+
+    @property
+    def speed_ratio(self) -> float:
+        """Top speed in radii per second over that of the robot that the settings are meant for; at least 1."""
+        return max(1.0, self.max_speed_um_s / self.radius_um / _NOMINAL_RADII_PER_S)
 
     def limited_to(self, frequency_hz: float | None) -> Robot:
         """A copy that is never driven at more than a frequency; None: without that limit."""

@@ -25,7 +25,7 @@ _LONGEST_BYTES = 4096  # of a command, and of its answer
 _PATIENCE_S = 1.0  # for the words of a connection; then it is closed
 _ANSWER_S = 5.0  # for the run's answer: it takes a command between two ticks
 _PAUSE_S = 0.1
-_BACKLOG = 16
+_BACKLOG = 16  # connections that wait to be accepted
 
 
 def _address(session: Path) -> str:

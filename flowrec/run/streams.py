@@ -44,7 +44,7 @@ class Streams:
     def __exit__(self, *error: object) -> None:
         self._closing.set()
         for thread in self._threads:
-            thread.join(_JOIN_S)  # one that waits for its device is left behind
+            thread.join(_JOIN_S)  # a thread that still waits for its device ends with the process
 
     def join(self, arriving: Iterator[Inputs]) -> Iterator[Inputs]:
         """The inputs with the messages that have come since the last ones."""

@@ -19,7 +19,7 @@ from .control.motion_axes import (
     MotionOfRun as MotionOfRun, MotionVerdict as MotionVerdict, contradiction as contradiction,
     orientation_by_motion as orientation_by_motion, own_gain as own_gain,
 )
-from .estimation.consistency_monitor import HealthMonitor as HealthMonitor
+from .estimation.consistency_monitor import EXPECTED_NIS as EXPECTED_NIS, HealthMonitor as HealthMonitor
 from .estimation.kalman import Kalman as Kalman, memory_s as memory_s
 from .estimation.luenberger import Luenberger as Luenberger
 from .estimation.observer import OBSERVERS as OBSERVERS, Observer as Observer
@@ -59,7 +59,6 @@ from .refine.network_inputs import LEAST_SPEED as LEAST_SPEED, LOG_STD as LOG_ST
 from .refine.observation_operator import (
     ObservationOperator as ObservationOperator, observation_operator as observation_operator,
 )
-from .refine.network_fit import Device as Device
 from .refine.pi_unet import PiUnet as PiUnet
 from .refine.refiner import REFINERS as REFINERS, Refiner as Refiner, keep_flow as keep_flow
 from .refine.residuals import Physics as Physics

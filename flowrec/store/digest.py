@@ -25,7 +25,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from flowrec.store.session_metadata import DIGEST, is_header_file
 
-_MODULUS = 1 << 256
+_MODULUS = 1 << 256  # of a sum of SHA-256
 _MESSAGE = struct.Struct("<IQ")  # sequence, log time
 _LARGE_BYTES, _LARGE = 1 << 16, struct.Struct("<QI")  # length, checksum
 HEAD = "head"  # key of the digest of the records that are no messages

@@ -188,7 +188,7 @@ _SEQUENCE_LIMIT = 2**32  # MCAP stores the sequence in 32 bit
 _RAW_IMAGE_DATA, _COMPRESSED_IMAGE_DATA = 6, 2  # numbers of the fields that hold the bytes
 # Up to these rates compression takes at most about a quarter and three quarters of a core, checksums included.
 _DELTA_PX_S = 80e6
-_ZSTD_PX_S = 400e6
+_ZSTD_PX_S = 400e6  # above it images are stored as they are
 _WIDE_COST = 2.7  # time for a pixel of 16 bit relative to one of 8 bit
 
 

@@ -45,7 +45,7 @@ CHUNK_LIMIT_BYTES = 72 << 20
 MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
 # Of schemas, channels, metadata and attachments together, each of which takes some 20 us. flowrec writes 60.
 DECLARED_LIMIT = 10_000
-_DECLARATIONS_KEPT = 1024
+_DECLARATIONS_KEPT = 1024  # in memory: most sessions of a folder have the same ones
 
 
 class Record(NamedTuple):

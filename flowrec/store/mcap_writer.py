@@ -37,7 +37,7 @@ from flowrec.core import SessionError, open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary, parse_summary
 
-_BUFFERS_PER_WRITE = 1024
+_BUFFERS_PER_WRITE = 1024  # IOV_MAX of Linux
 
 
 class McapWriter:

@@ -22,11 +22,11 @@ from flowrec.core import SessionError, UsageError
 from flowrec.store.traffic import HiddenError, MissingError, RefusedError, TransientError
 
 CONNECTIONS = 32  # requests at a time
-_REDIRECTS = 3
+_REDIRECTS = 3  # followed for one request
 _PIECE_BYTES = 1 << 16
 _ENDPOINTS = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AZURE_STORAGE_ENDPOINT", "GOOGLE_BASE_URL")
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
-_OK, _PARTIAL, _NO_RANGE, NOT_OFFERED = 200, 206, 416, 501
+_OK, _PARTIAL, _NO_RANGE, NOT_OFFERED = 200, 206, 416, 501  # statuses of HTTP
 _LATER = (408, 425, 429)  # a time limit, too early, too many requests
 _NOT_INSTALLED = "{}: reading from a URL needs a package; pip install 'flowrec[remote]'"
 _WHOLE_ONLY = "can not be read in ranges, the server sends whole files only; copy it to this machine"

@@ -28,7 +28,7 @@ _END_BYTES = 256 << 10
 _AHEAD_BYTES = 48 << 20
 _GAP_BYTES, _JOINED_BYTES = 64 << 10, 8 << 20
 _NEAR_BYTES = 1 << 20  # what is read so near before the known end is fetched up to it
-_REMEMBERED, _REMEMBERED_S = 64, 60.0
+_REMEMBERED, _REMEMBERED_S = 64, 60.0  # openings, and for how long they hold
 _TOGETHER = 8  # objects that are opened at a time
 
 

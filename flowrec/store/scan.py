@@ -34,7 +34,7 @@ _CHUNK_PATTERN = re.compile(rb"(?s)(?=\x06.{24}(.{8}).{4}(?:\x04\x00\x00\x00zstd
 _PATTERN_BYTES = RECORD_HEAD.size + CHUNK_HEAD.size + 16
 _WINDOW_BYTES = 1 << 20
 _TRIES = 8  # how often, on average, a damaged byte may be read
-_SEQUENCES = 2**32
+_SEQUENCES = 2**32  # a sequence number of MCAP has 32 bits
 _DECLARING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _TIMES_DECLARED = 2  # in the file and in its index
 

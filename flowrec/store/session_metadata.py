@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flowrec.physics import Chip
     from flowrec.stages import ResolvedConfig
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # of the session's file; a reader refuses any other
 PROFILE = "flowrec"
 
 # Metadata records.

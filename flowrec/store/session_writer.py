@@ -62,7 +62,7 @@ def cut_session(reader: SessionReader, output: Output, from_ns: int, to_ns: int)
     return count
 
 
-_QUEUE_S = 4.0
+_QUEUE_S = 4.0  # of images, that wait where the disk stalls
 _LARGEST_PICTURE_BYTES = 50_000_000
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 64_000_000, 1_250_000_000
 

@@ -129,7 +129,7 @@ OBSERVED = {
     "own_v_um_s": "the robot's own motion through the fluid as assumed, along y; it is subtracted already",
     "time_s": "middle of the time that the flow is a mean over, on the session clock",
 }
-_NEEDED = 4
+_NEEDED = 4  # of these columns, the first
 _DEFAULT_STD = 0.05  # of the rms speed, where no standard deviation is given
 _NAMES = list(OBSERVED)
 _WANTED = f"the columns are {', '.join(_NAMES[:_NEEDED])} and, where known, {', '.join(_NAMES[_NEEDED:])}"

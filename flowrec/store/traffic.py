@@ -16,7 +16,7 @@ from flowrec.core import SessionError, UsageError
 
 TIMEOUT_KEY = "FLOWREC_TIMEOUT_S"  # environment variable; the option --timeout sets it
 _TIMEOUT_S = 30.0
-_TRIES, _PAUSE_S = 4, 0.2
+_TRIES, _PAUSE_S = 4, 0.2  # of a request; the pause before the second try, doubled each time
 _NAMED = 3  # causes of repetitions that are named
 _Answered = TypeVar("_Answered")
 

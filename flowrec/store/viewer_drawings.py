@@ -21,12 +21,13 @@ from flowrec.store.viewer_scene import CHIP, MAP, STILL, Picture, ViewerScene, s
 _GRID_DATA, _CIRCLES, _POINTS, _TRANSFORMS = 9, 1, 2, 1  # numbers of fields
 # The robot and the goal are drawn as rings: a single point of Rerun's default size is hidden by the path.
 _RING_POINTS, _RING_RADII = 32, 1.5  # radii of the robot
-_RADII_OF_GOAL = 2.5
+_RADII_OF_GOAL = 2.5  # of the robot, of the ring around its goal
 _LINE_PX = 1.5  # of the image, at most; thinner on a small one
 _LINE_SHARE = 1.0 / 200.0  # of the image's width
 _ROUNDING = np.uint32(1 << 11)  # half of the last bit kept of a float's 23; the rest are 0 and compress
 _NO_COLOUR = fg.Color(r=0.0, g=0.0, b=0.0, a=0.0)
 Rgba = tuple[int, int, int, int]
+# Red, green, blue and opacity, 0 to 255.
 _ROBOT, _UNSEEN, _PATH, _GOAL = (255, 112, 32, 255), (200, 200, 200, 255), (0, 216, 255, 255), (64, 255, 96, 255)
 _WALL, _WALL_POINTS = (130, 130, 130, 255), 4000  # points at most
 

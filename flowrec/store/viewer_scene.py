@@ -23,7 +23,7 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.core import MM_PER_UM, FlowField, FlowrecError, Matrix, Message, Mission, Route, Shift, shift_px
+from flowrec.core import HALF_PX, MM_PER_UM, FlowField, FlowrecError, Matrix, Message, Mission, Route, Shift, shift_px
 from flowrec.physics import Calibration, on_chip
 from flowrec.store.codec import timestamp
 from flowrec.store.frame_encodings import CAMERA_FRAME
@@ -33,7 +33,6 @@ from flowrec.store.session_metadata import SessionHeader
 ROOT, CHIP, MAP = "tf#/", "chip", "map"
 LENGTHS, UNIT = "lengths", "mm"  # key and value in the metadata of viewer topics; absent in older files: m
 HEIGHT = {"mm": 3.0, "m": 0.2}  # of the cameras over the chip; Rerun clips what is nearer than 0.1
-_HALF_PX = 0.5
 _RADIUS_UM = 60.0  # of a robot whose size is not known
 _Number = TypeVar("_Number", float, NDArray[np.float64])
 STILL, _OVER = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0), fg.Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)
@@ -65,7 +64,7 @@ class Picture:
     def _inverse(self) -> list[list[float]]:
         """(2, 3): pixel, from the corner of the first, of chip coordinates (x, y, 1) in um."""
         back = np.linalg.inv(self.matrix[:, :2])
-        return np.column_stack((back, _HALF_PX - back @ self.matrix[:, 2])).tolist()
+        return np.column_stack((back, HALF_PX - back @ self.matrix[:, 2])).tolist()
 
     def to_px(self, points_um: NDArray[np.float64]) -> NDArray[np.float64]:
         """Chip points (n, 2) in um as pixels (n, 2), counted from the corner of the first."""
@@ -91,7 +90,7 @@ class Picture:
 
     def transform(self) -> fg.FrameTransform:
         """Pose of the pinhole camera: over the middle of the image, or behind it if that is mirrored."""
-        middle = np.array([0.5 * self.width_px - _HALF_PX, 0.5 * self.height_px - _HALF_PX, 1.0])
+        middle = np.array([0.5 * self.width_px - HALF_PX, 0.5 * self.height_px - HALF_PX, 1.0])
         x, y = (MM_PER_UM * (self.matrix @ middle)).tolist()
         angle_rad = math.atan2(self.matrix[1, 0], self.matrix[0, 0])  # of the rows of pixels, from x to y
         sin, cos = math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)

@@ -196,7 +196,7 @@ def _beside_map(
 # The fields of Tick that viewer topics are made of.
 INPUTS = frozenset(("assumed", "refined", "shift", "route", "mission", "estimate", "track", "observations", "demand"))
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
-_NEVER = -(1 << 62)
+_NEVER = -(1 << 62)  # ns, before every stamp
 VERDICT = "/verdict"
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec.core import NS_PER_S, AxesVerdict, UsageError, say, seconds, table, warn
+from flowrec.core import NS_PER_S, Z95, AxesVerdict, UsageError, say, seconds, table, warn
 from flowrec.measure import (
     ANYWHERE,
     UNEXPLAINED,
@@ -45,7 +45,6 @@ from flowrec.verbs.misfit import (
 from flowrec.verbs.preparation import Prepared
 
 _FAR = 0.3  # relative difference of um_per_rev from which it is doubtful whether the log is of this run
-_Z95 = 1.96
 _SIGNIFICANT = 3.0  # standard errors
 _WITHOUT = "import it as it is with --no-align, and set movie.clock_offset_s and movie.clock_rate yourself"
 
@@ -211,7 +210,7 @@ def _tell(asked: Config, fit: MotionFit, offset_s: float) -> None:
             f"{found}: this is used, not robot.um_per_rev = {stated:g}; to keep that, import with --no-align and the "
             f"settings movie.* of this session{doubt}"
         )
-    elif abs(fit.um_per_rev - stated) > _Z95 * fit.um_per_rev_std:
+    elif abs(fit.um_per_rev - stated) > Z95 * fit.um_per_rev_std:
         warn(
             f"{found}; robot.um_per_rev = {stated:g} is used; to use what was found: --set "
             f"robot.um_per_rev={fit.um_per_rev:.4g}"

@@ -35,14 +35,14 @@ from flowrec.verbs.verdict import (
     DAMAGED,
     GAP_PERIODS,
     NO_DIGEST,
+    RATE_TOLERANCE,
     UNFINISHED,
     Tally,
     Verdict,
 )
 
 _LISTED = 4  # gaps, kinds of numbers and settings of a clock that are named one by one
-_RATE_TOLERANCE = 0.05
-_CLOCK_JUMP_S = 1.0
+_CLOCK_JUMP_S = 1.0  # of the wall clock against the monotonic one: more than any drift in a run
 HEAD = ("configuration", "chip", "provenance", "outcome")
 _CLOCKS = ("wall_ns", "monotonic_ns")
 EXACT = "yes: configuration, chip, and the inputs of every tick"
@@ -220,7 +220,7 @@ class FileCheck:
             text = f"{verdict.gap_count} times more than {GAP_PERIODS} periods without a frame: {', '.join(listed)}"
             verdict.odd("gaps", text)
         wanted_hz = self._config.camera.rate_hz if self._config is not None else None
-        if wanted_hz and tally.period_ns and abs(rate_hz / wanted_hz - 1.0) > _RATE_TOLERANCE:
+        if wanted_hz and tally.period_ns and abs(rate_hz / wanted_hz - 1.0) > RATE_TOLERANCE:
             verdict.odd("rate", f"{rate_hz:.1f} frames per second instead of camera.rate_hz = {wanted_hz:g}")
 
     def _images(self) -> None:

@@ -59,7 +59,7 @@ def _values_by_key() -> dict[str, list[str]]:
     from flowrec.stages import setting_rows
 
     found = {row.key: _values(row.valid, row.default) for row in setting_rows()}
-    with contextlib.suppress(OSError):  # the next completion takes as long
+    with contextlib.suppress(OSError):  # without a cache the next completion takes as long as this one
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps({"state": state, "settings": found}), encoding="utf-8")
     return found

@@ -42,21 +42,21 @@ from flowrec.stages import (
 from flowrec.store import frames_of, image_bytes_s
 from flowrec.verbs.admission import rehearse, route_on_assumed_flow
 from flowrec.verbs.preparation import refuse_adrift
+from flowrec.verbs.verdict import RATE_TOLERANCE
 from flowrec.view import executable, has_display
 
 T = TypeVar("T")
 OK, WARNING, FAILURE = "ok", "warning", "failure"
 _SIGNS = {OK: " ", WARNING: "!", FAILURE: "x"}
 _OF_DEVICES = ("camera", "coils", "lab")  # sections
-_RATE_TOLERANCE = 0.05
-_CLOCK_TOLERANCE = 0.01
+_CLOCK_TOLERANCE = 0.01  # relative: 20 times what a crystal is off (CRYSTAL_PPM)
 _LOSS_WARNING, _LOSS_FAILURE = 0.001, 0.05  # fraction of the blocks
 _DARK = 0.1  # of the full scale
 _TRIAL_BYTES = 128 << 20
 _HEADROOM = 2.0  # of the disk's speed over the rate of a run
-_LEAST_MINUTES = 10.0
+_LEAST_MINUTES = 10.0  # of a run, for which the disk has to have room
 _SILENT_S = 0.3  # longer than lab.guardian_s
-_OLD_DAYS = 90.0
+_OLD_DAYS = 90.0  # since the file of the configuration was changed, after which it may not fit any more
 _SEES_ALL = 1.02  # of a side of the view: a chip that is larger is not seen whole
 # By how much the encodings compress the images of a camera at least; frame_encodings.py has the measurements.
 _PACKED = {"raw": 1.0, "zstd": 1.3, "delta": 1.8, "png": 1.8, "jpeg": 6.0}
@@ -220,7 +220,7 @@ def _camera(config: ResolvedConfig, chip: Chip | None) -> _Rows:
             "camera.height_px and camera.bits to that",
         )
     yield from (("camera", WARNING, note) for note in seen.notes)
-    wrong = abs(seen.rate_hz / camera.rate_hz - 1.0) > _RATE_TOLERANCE
+    wrong = abs(seen.rate_hz / camera.rate_hz - 1.0) > RATE_TOLERANCE
     text = f"{seen.rate_hz:.1f} frames per second, longest interval {seen.arrival_ms:.0f} ms"
     advice = f", where camera.rate_hz = {camera.rate_hz:g}: set it, a shorter exposure or a smaller image"
     yield "rate", WARNING if wrong else OK, text + (advice if wrong else "")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
-_PNG_SIZE_AT = 16
+_PNG_SIZE_AT = 16  # bytes, after the signature and the head of the first part
 _REPEATED = ("reason", "duration")  # the second is a sentence of older files
 _STATED = ("seed", "world", "operator", "sample", "notes")  # in the provenance
 _OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _PERIOD_S = 0.12
 _CLOSE_TIMEOUT_S = 0.3  # for the last events to be shown
-_EVENTS_LIMIT = 1000
+_EVENTS_LIMIT = 1000  # that wait to be shown
 _COLOURS: dict[str, str] = {Level.WARNING: "yellow", Level.ERROR: "red"}
 _QUEUE_SHOWN_MB = 1.0  # a smaller queue of the writer is usual
 _NOTE_SHOWN = 60  # characters of a long note, from its end

@@ -35,7 +35,7 @@ from flowrec.verbs.first_pass import MovieTracks
 from flowrec.verbs.preparation import UNCHECKED
 
 _WINDOW_S = 0.3  # of the mean velocities: longer than noise of a track, shorter than most commands hold
-_LEAST_WINDOWS = 4
+_LEAST_WINDOWS = 4  # with fewer, nothing is said of the log
 _HIDES_PX = 0.5  # root mean square from which on shake hides the commands; 1 px at 3 Hz does in simulated movies
 _STILL = 0.15  # of the speed that the log drives
 _CARRIED = 0.8  # share of the motion that the flow explains, from which on the body is not driven

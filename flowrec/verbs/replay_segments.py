@@ -26,7 +26,7 @@ from flowrec.verbs.session_replay import replay_session
 
 _TICKS = 300  # of a segment at least: restoring its start takes as long as a few of them
 _PER_JOB = 4  # segments, because those with work orders take longer
-_JOBS_LIMIT = 256
+_JOBS_LIMIT = 256  # more processes than machines have cores
 _POLL_S = 0.2  # until a request to stop is seen
 
 Segment = tuple[int | None, int]  # stamps of the first and the last tick; None: the beginning of the session

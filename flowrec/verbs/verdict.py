@@ -29,12 +29,13 @@ from flowrec.core import (
 from flowrec.stages import TrackQuality
 from flowrec.store import Audit
 
-GAP_PERIODS = 1.5
+RATE_TOLERANCE = 0.05  # relative, of the rate of images against the one that was asked for
+GAP_PERIODS = 1.5  # between two frames from which on one is missing: halfway between one period and two
 LISTED = 100  # longest gaps, and settings of the wall clock, that are kept in memory
 _PENDING = 100_000  # incomplete ticks in memory; in files of flowrec these are half a second of ticks
 _STEP_NS = 10_000  # resolution of the histogram of intervals
 _INTERVALS = 100_000  # bins of that histogram
-_FRAME, _APPLIED, _TRACK, _NO_IMAGE = 1, 2, 4, 8
+_FRAME, _APPLIED, _TRACK, _NO_IMAGE = 1, 2, 4, 8  # bits: which messages a tick has
 _BITS = {"frame": _FRAME, "applied": _APPLIED, "track": _TRACK}
 
 

@@ -52,7 +52,7 @@ IMAGE = "/camera/frame"
 MAPS = {"/view/flow_assumed": "Assumed flow", "/view/flow_refined": "Refined flow"}
 ON_IMAGE = ("/camera/frame/path", "/camera/frame/goal", "/camera/frame/robot")  # points on the chip
 EVENTS = ("/run/events", "/operator/events")
-_LINES = 12  # of one plot
+_LINES = 12  # in one plot at most
 
 
 def plot_of(topic: Topic, first: Message | None) -> Plot | None:

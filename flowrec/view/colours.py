@@ -17,6 +17,7 @@ Table = Literal["speed", "uncertainty", "change", "time", "arrows"]
 
 SOLID: Rgb = (48, 48, 54)  # walls, and what is not known
 UNREACHABLE: Rgb = (110, 40, 44)  # fluid from which the goal can not be reached
+# For lines and words over a grey image, or on black.
 ORANGE: Rgb = (255, 140, 26)
 CYAN: Rgb = (64, 214, 255)
 GREEN: Rgb = (92, 224, 92)

@@ -19,6 +19,7 @@ from flowrec.store import nonzero_window
 from flowrec.view.colours import SOLID, Rgb
 
 Picture = NDArray[np.uint8]
+NOMINAL_PX = 640.0  # width of an image that sizes of drawings are meant for; they grow with the image
 SUBPIXEL_BITS = 4  # coordinates of OpenCV's lines are given in 1/16 px
 _DIMMING = 0.6  # factor on an older image, which shows that it is older
 _RIM = 0.75  # opacity of the rim

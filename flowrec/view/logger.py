@@ -41,7 +41,7 @@ from flowrec.stages import tells_flow
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.colours import Rgb
-from flowrec.view.drawing import CIRCLE, CROSS, Trail, WindowCompleter, encode_jpeg
+from flowrec.view.drawing import CIRCLE, CROSS, NOMINAL_PX, Trail, WindowCompleter, encode_jpeg
 from flowrec.view.entities import ColumnBuffer, EntityLogger, label, points
 from flowrec.view.scene import Scene, goal_of, place_on_chip, way_of
 
@@ -121,9 +121,8 @@ class StateLogger:
         self._log(lane, rr.StateChange(state=state))
 
 
-_JPEG_QUALITY = 85
-_NOMINAL_PX = 640.0  # width of the image that the sizes below are meant for
-_TRAIL_STEP_PX = 1.0
+_JPEG_QUALITY = 85  # 0 to 100, of OpenCV's encoder
+_TRAIL_STEP_PX = 1.0  # of NOMINAL_PX, between two points of the robot's trail
 _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 _SHOWN = (  # fields of a tick, in the order in which they are logged
@@ -169,7 +168,7 @@ class TickLogger:
         self._tick = self._last = Tick()
         self._tells_flow = True
         left, _, right, _ = scene.image_bounds()
-        self._unit_px = (right - left) / _NOMINAL_PX
+        self._unit_px = (right - left) / NOMINAL_PX
         self._trail = Trail(_TRAIL_STEP_PX * self._unit_px)
         self._robot_px = scene.length_px(scene.robot.radius_um)
         self.states = StateLogger(self._entities, doubtful=bool(scene.doubts))

@@ -16,17 +16,16 @@ from numpy.typing import NDArray
 from flowrec.core import Estimate, Floats, FlowField, Tick, shift_px
 from flowrec.view import colours
 from flowrec.view.colours import round_below
-from flowrec.view.drawing import CIRCLE, Layer, Picture, Trail, arrows, draw_outline, drawable, restore
+from flowrec.view.drawing import CIRCLE, NOMINAL_PX, Layer, Picture, Trail, arrows, draw_outline, drawable, restore
 from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.scene import Scene, goal_of, way_of
 from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, StatusBar
 
 _LEAST_WIDTH_PX = 480  # smaller images are enlarged by a whole factor, so that words and lines are readable
-_NOMINAL_PX = 640.0  # width of the picture that the sizes below are meant for
 _LETTER_PX = 13.0
 _LINE_PX = 1.6
 _SPARSER = 1.9  # distance of the arrows over that of the viewer's map, which is larger
-_TRAIL_STEP_PX = 3.0
+_TRAIL_STEP_PX = 3.0  # between two points of the trail: its lines are thicker than the viewer's
 _RING_PX = 3.0  # between the robot and its ring
 _LONGEST = 0.9  # arrow, in spacings of the arrows
 _FASTEST = 0.99  # quantile of the speeds that has this length
@@ -48,7 +47,7 @@ class Overlay:
     def __init__(self, scene: Scene, image_px: tuple[int, int]) -> None:
         self.zoom = max(1, math.ceil(_LEAST_WIDTH_PX / image_px[0]))
         self._width, self._height = (self.zoom * each for each in image_px)
-        self._unit = max(1.0, self._width / _NOMINAL_PX)
+        self._unit = max(1.0, self._width / NOMINAL_PX)
         letter = round(_LETTER_PX * self._unit)
         width, height = self._width, self._height + round(1.9 * letter)
         self.size_px = width + width % 2, height + height % 2

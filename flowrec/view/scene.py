@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flowrec.core import Floats, Matrix, Mission, Route, Tick, shift_px
+from flowrec.core import HALF_PX, Floats, Matrix, Mission, Route, Tick, shift_px
 from flowrec.physics import Calibration, Chip, Robot, on_chip
 
-_HALF_PX = 0.5
 Box = tuple[float, float, float, float]  # left, top, right, bottom
 _MARGIN = 0.03  # around the channels, of their longer side
 
@@ -37,7 +36,7 @@ class Scene:
 
     def to_plane(self, points_um: ArrayLike) -> Floats:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""
-        return self.calibration.to_px(points_um) + _HALF_PX
+        return self.calibration.to_px(points_um) + HALF_PX
 
     def image_to_plane(self, tick: Tick) -> Floats:
         """(2, 3): where a point (x, y, 1) of the camera's image of a tick lies in the picture plane.
@@ -48,7 +47,7 @@ class Scene:
         if _registration(tick) is None and not any(off_px):
             return np.eye(2, 3)
         corners = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
-        measured_um = self.calibration.for_shift(off_px).to_um(corners - _HALF_PX)
+        measured_um = self.calibration.for_shift(off_px).to_um(corners - HALF_PX)
         moved = self.to_plane(place_on_chip(tick, measured_um))
         return np.column_stack((moved[1] - moved[0], moved[2] - moved[0], moved[0]))
 
@@ -58,7 +57,7 @@ class Scene:
 
     def from_plane(self, places: Floats) -> Floats:
         """The picture plane (..., 2) to chip coordinates (..., 2) in um."""
-        return self.calibration.to_um(places - _HALF_PX)
+        return self.calibration.to_um(places - HALF_PX)
 
     def directions(self, vectors: Floats) -> Floats:
         """Vectors (..., 2) along the chip's axes as vectors of the same length in the picture plane."""
@@ -71,11 +70,11 @@ class Scene:
     def mask_to_plane(self) -> Matrix:
         """(2, 3): where a point (x, y, 1) of an image on the pixels of the chip's mask lies; from pixel corners."""
         scale, axes = self.length_px(self.chip.um_per_px), self.calibration.axes
-        return np.column_stack((scale * axes, self.to_plane((0.0, 0.0)) - _HALF_PX * scale * axes.sum(axis=1)))
+        return np.column_stack((scale * axes, self.to_plane((0.0, 0.0)) - HALF_PX * scale * axes.sum(axis=1)))
 
     def preview_to_plane(self, step: int) -> Matrix:
         """(2, 3): the same for a camera image of which only each `step`-th row and column is shown."""
-        return np.column_stack((step * np.eye(2), np.full(2, _HALF_PX * (1 - step))))
+        return np.column_stack((step * np.eye(2), np.full(2, HALF_PX * (1 - step))))
 
     def outlines(self) -> list[Floats]:
         """The walls in the picture plane: closed lines (n, 2) along the border of the mask."""
@@ -94,7 +93,7 @@ class Scene:
 
     def _box(self, columns: ArrayLike, rows: ArrayLike) -> Box:
         """The upright box around the pixels of the mask from a column to another, and from a row to another."""
-        corners = (np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2) - _HALF_PX) * self.chip.um_per_px
+        corners = (np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2) - HALF_PX) * self.chip.um_per_px
         places = self.to_plane(corners)
         (left, top), (right, bottom) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
         return left, top, right, bottom

@@ -15,11 +15,11 @@ NAME = "flowrec-catalog.parquet"  # in the folder that is catalogued
 PARQUET = (".parquet",)
 KEY = "flowrec_catalog"  # of the file's metadata: About, as JSON
 FORMAT = 2  # of the columns and what they mean
-# Lists of structures: an expression of `find` that names a member has a row for each.
+# Lists of structures. Where an expression of `find` names a member, each element of the list has a row.
 EVENTS, SWEEP = "events", "sweep"
 RELATIONS = {EVENTS: "no event states", SWEEP: "no replay states"}
-SIGNATURE = "signature"  # column of what tells whether a session has changed
-PLACE = "path_bytes"  # column by which a session is known: its name may be no text, and hold any byte
+SIGNATURE = "signature"  # column of the value that differs once a session has changed
+PLACE = "path_bytes"  # column that identifies a session, in bytes: a file's name need not be valid text
 
 
 @dataclass(frozen=True, slots=True)

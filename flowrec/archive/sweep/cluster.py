@@ -30,7 +30,7 @@ except ModuleNotFoundError as error:
     raise UsageError("a sweep needs Dask, which is not installed: pip install 'flowrec[cluster]'") from error
 
 _CONNECT_S = 10.0
-_STARTS = 3
+_STARTS = 3  # tries, because a worker may be killed before it is ready
 _QUEUED = 16  # tasks at least that the scheduler of a cluster knows, by which it may ask for more workers
 _COMPARED = ("distributed", "dask")
 

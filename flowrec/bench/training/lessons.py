@@ -20,7 +20,7 @@ from flowrec.physics import Chip, FlowSolver, read_vessel_case
 from flowrec.stages import ObservationOperator, observation_operator
 
 _MASK_ERRORS = ("grown", "shrunk", "shifted")  # of those that are drawn
-_MASK_ERROR_PROBABILITY = 0.15
+_MASK_ERROR_PROBABILITY = 0.15  # of a mask with one of these errors; the others are right
 _OUTLIER_PROBABILITY = 0.25  # of one set of observations; up to a seventh of them are outliers then
 _SOLVER = FlowSolver(2)
 

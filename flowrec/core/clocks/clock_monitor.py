@@ -12,8 +12,8 @@ from flowrec.core.diagnostics import Clocks
 from flowrec.core.units import nanoseconds, seconds
 
 _SET_S = 0.01  # a larger change of the wall clock relative to the monotonic one means that it was set
-_SIMULTANEOUS_NS = 100_000
-_ATTEMPTS = 5
+_SIMULTANEOUS_NS = 100_000  # between two readings of one clock, with the other clock's between them
+_ATTEMPTS = 5  # to read both clocks within that time
 _EVERY_NS = nanoseconds(1.0)  # between the messages on the session clock
 _COUNTS = 1 << 63  # largest counter that a message can hold
 CRYSTAL_PPM = 500.0  # largest plausible error of a camera's clock

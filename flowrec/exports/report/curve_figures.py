@@ -12,12 +12,12 @@ from flowrec.exports.report.curves import Curve
 from flowrec.exports.report.report_data import ReportData
 from flowrec.exports.report.time_axis import line, observation_points, panels, shown_observations
 from flowrec.physics import on_chip, sample
+from flowrec.stages import EXPECTED_NIS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_EXPECTED_NIS = 2.0  # of a two-dimensional measurement
 _RECORDING_PANEL_MM = 20.0
 
 
@@ -189,8 +189,8 @@ class ObserverFigure:
         style.legend_above(axes[0])
         if nis:
             line(axes[2], nis, style.QUIET, "")
-            axes[2].axhline(_EXPECTED_NIS, color=style.INK, lw=0.6, ls=(0, (3, 2)))
-            axes[2].set_ylim(0.0, max(2.0 * _EXPECTED_NIS, 1.05 * nis.largest))
+            axes[2].axhline(EXPECTED_NIS, color=style.INK, lw=0.6, ls=(0, (3, 2)))
+            axes[2].set_ylim(0.0, max(2.0 * EXPECTED_NIS, 1.05 * nis.largest))
             axes[2].set_ylabel("consistency")
         return figure
 

@@ -10,7 +10,7 @@ import numpy as np
 from flowrec.core import Floats, seconds
 
 BUCKETS = 600  # of 0.3 mm in the widest figure
-_MOST_SPANS = 200
+_MOST_SPANS = 200  # in one timeline; later ones are not drawn
 _GAP = 4.0  # of the usual interval of values: a longer one interrupts the line
 
 

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 _MARGIN = 0.06  # around the fluid, of its width
 _OVER_PICTURE = 0.72  # opacity of the flow over the camera's picture
 _TALLEST_MM = 200.0
-_AROUND_TRACK_RADII = 4.0
+_AROUND_TRACK_RADII = 4.0  # of the robot, around its track: room for the names of the ends
 _BAR_MM, _BELOW_MM = 17.0, 6.0  # beside the picture: the colour bar; below it: the scale bar
 _SAME_PLACE = 4.0  # radii of the robot: an end this near to the goal has no name of its own
 _NEAR_EDGE = 0.08  # of the width: a name beside the edge begins or ends at its place
 _HEAD_SHARE = 0.004  # of the path, half of what an arrow head points along
 _HEADS = 7  # arrow heads on the path
-_PT_PER_INCH = 72.0
+_PT_PER_INCH = 72.0  # of a font's size: DTP points
 _BAR_SHARE = 0.25  # longest scale bar, of the width
 
 

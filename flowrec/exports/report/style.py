@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-MM_PER_INCH = 25.4
+MM_PER_INCH = 25.4  # exactly, by its definition
 NARROW_MM, WIDE_MM = 88.0, 180.0  # one and two columns of a journal
 WIDTHS_MM = (NARROW_MM, WIDE_MM)
 INK, QUIET, FAINT, SOLID = "#222222", "#767676", "#dddddd", "#c8c8c8"

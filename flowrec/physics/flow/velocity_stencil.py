@@ -21,7 +21,7 @@ from flowrec.core import bilinear, compiled
 SIZE = 8  # rows and columns of the weights: four for the cubic, and two more on each side for continued values
 _BEFORE = 3  # of them before the pixel to the upper left of the place
 _LEAST_DISTANCE = 0.02  # in steps, of a wall from a centre: nearer ones would need large weights; masks keep 0.1
-_STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))  # right, left, ...
 
 Floats = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from flowrec.core import Image, compiled, pixel_type
 from flowrec.physics import Calibration, clearance_um
 from flowrec.stages import CameraSettings, Optics, SimulatedImage
 
-_POOL = 1 << 20
+_POOL = 1 << 20  # normal numbers drawn once; an image takes its noise from them at random offsets
 _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
 
 

@@ -47,7 +47,7 @@ from flowrec.stages import (
     registration_of,
 )
 
-_COILS = 3
+_COILS = 3  # x, y and z
 _SKEW_PPM = 50.0  # of a crystal, at most
 _STEADY_S = 0.1  # a field that has not risen for so long is up
 _STARTED_S = 3600.0  # ago, at most

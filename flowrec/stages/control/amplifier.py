@@ -13,7 +13,7 @@ from flowrec.core import Floats, Range
 PerCoil = tuple[float, float, float]  # one number for each coil: x, y, z
 WORST_CONDITION = 1e3  # largest condition number of the matrix mt_per_a that is accepted
 _TURN_RAD = 2.0 * math.pi
-_H_PER_MH = 1e-3
+_H_PER_MH = 1e-3  # henry per millihenry
 
 
 @dataclass(frozen=True, slots=True)

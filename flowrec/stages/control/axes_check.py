@@ -19,7 +19,7 @@ from flowrec.physics import Calibration, Robot
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.control.motion_axes import MotionVerdict, coil_settings, contradiction, orientation_by_motion
 
-LIMIT_S = 3.0
+LIMIT_S = 3.0  # of driving, after which the check ends in any case
 _WAYS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # of the legs of a round
 _FIRST_ACROSS = 2  # leg along the other axis, from which on each position may decide
 _LEG_S = 0.6  # at most, so that a round of a slow robot ends within the limit

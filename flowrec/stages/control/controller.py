@@ -32,12 +32,12 @@ from flowrec.core import (
 )
 from flowrec.physics import CONTROL, Robot
 from flowrec.stages.control.delay_compensation import append_demand, corrected_flow, predict_position
-from flowrec.stages.control.tracking_laws import Reference, Situation, TrackingLaw, limit_length, speed_ratio
+from flowrec.stages.control.tracking_laws import Reference, Situation, TrackingLaw, limit_length
 from flowrec.stages.control.trajectory import follow
 
 _LEAST_SLOPE = 0.3  # below this gradient of the clearance the point is in the middle between two walls
 _NEAR_RADII = 4.0  # waypoints within this distance count
-_MOST_WAYPOINTS = 16
+_MOST_WAYPOINTS = 16  # of those near the robot that are compared in a tick
 
 
 def wall_barrier(
@@ -202,7 +202,7 @@ class Controller:
         law = _law(self)
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
         sent = previous.sent_um_s if previous is not None else _NOTHING_SENT
-        lag_s = 0.0 if estimate_uses_map else self.observer_lag_s / speed_ratio(robot)
+        lag_s = 0.0 if estimate_uses_map else self.observer_lag_s / robot.speed_ratio
         flow = corrected_flow(field, estimate, sent, CONTROL.of(field, self.map_error), lag_s)
         now = Situation(
             previous=previous,

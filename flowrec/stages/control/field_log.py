@@ -18,7 +18,7 @@ from flowrec.stages.control.field_rotation import MotionSegment
 
 _COILS = 3  # where no row says otherwise
 _FREQUENCY, _HEADING, _AMPLITUDE, _CURRENTS = 0, 1, 2, slice(3, None)
-_LEAST_ROWS = 64
+_LEAST_ROWS = 64  # by which the log grows at least; it doubles
 _PARTS = 8  # steps from row to row in which an interpolated field changes
 
 

@@ -20,7 +20,7 @@ from flowrec.stages.control.tracking_laws import Reference, Situation, VectorLaw
 from flowrec.stages.control.trajectory import nearest_time, position_at
 
 Raster = NDArray[np.float32]
-_HEADINGS = 64
+_HEADINGS = 64  # compared first, 5.6 degrees apart; a parabola through the best one refines it
 _STEP_PX = 1.5  # between points that are evaluated on the way, so that no wall is missed
 _ANGLES = np.arange(_HEADINGS) * (2.0 * np.pi / _HEADINGS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], -1)

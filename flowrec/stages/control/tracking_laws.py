@@ -16,7 +16,6 @@ from flowrec.core import Demand, Estimate, Floats, FlowField, Mission, Route
 from flowrec.physics import Robot, sample
 from flowrec.stages.control.delay_compensation import CorrectedFlow
 
-_NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are meant for
 _LARGEST_CORRECTION = 0.3  # of an error, within one frame
 
 
@@ -45,7 +44,7 @@ class Situation:
         """A rate in proportion to the robot's speed; a third of an error at most is corrected within one frame."""
         if self.dt_s <= 0.0:
             return per_s
-        return max(per_s, min(per_s * speed_ratio(self.robot), _LARGEST_CORRECTION / self.dt_s))
+        return max(per_s, min(per_s * self.robot.speed_ratio, _LARGEST_CORRECTION / self.dt_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,8 +174,3 @@ def limit_length(vector: Floats, limit: float) -> tuple[Floats, bool]:
     """The vector, scaled down to a length if it is longer, and whether it was."""
     length = math.hypot(*vector)
     return (vector, False) if length <= limit else (vector * (limit / length), True)
-
-
-def speed_ratio(robot: Robot) -> float:
-    """Speed in radii per second over that of the robot that the settings are meant for; at least 1."""
-    return max(1.0, robot.max_speed_um_s / robot.radius_um / _NOMINAL_RADII_PER_S)

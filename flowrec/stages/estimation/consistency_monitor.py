@@ -55,7 +55,6 @@ _SETTLED = 0.6  # fraction of the window's weight that must be present
 _IMPROVEMENT = -0.5
 _FREE_RADII = 1.3  # from a wall: nearer to it the robot may touch it or be slowed by it
 _HIGH = 0.5  # fraction of the frequency limit below which step-out is not looked for
-_NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that `window_s` is meant for, as in tracking_laws.py
 _FEWEST_FRAMES = 8  # in a window
 _FULL = 0.8  # the same for a single frame whose motion enters the mean that the step-out frequency is found from
 _LEAST_STEP = 0.95  # a learned limit falls at least to this fraction of the one before
@@ -78,8 +77,7 @@ class StepOut:
         """`window_s`, shorter for a robot that is faster than it is meant for: it is carried away sooner."""
         if not self.learned:
             return self.window_s
-        ratio = max(robot.max_speed_um_s / robot.radius_um / _NOMINAL_RADII_PER_S, 1.0)
-        return min(max(self.window_s / ratio, _FEWEST_FRAMES * dt), self.window_s)
+        return min(max(self.window_s / robot.speed_ratio, _FEWEST_FRAMES * dt), self.window_s)
 
     def _lower_hz(self, rolled_um_s: float, expected_um_s: float, limit_hz: float, robot: Robot) -> float:
         """Next limit of the field's frequency for a robot that rolls slower than its revolutions demand."""
@@ -149,7 +147,7 @@ class StepOut:
 
 
 _BANK_HZ, _STEP, _ABOVE = 0.3, 1.125, 24  # of the bank: a frequency, the ratio of neighbours, how many from there on
-_EXPECTED_NIS = 2.0
+EXPECTED_NIS = 2.0  # of a measurement in two dimensions by a consistent filter
 _LARGEST_NIS = 50.0  # a single lost step must not cause a minute of alarm
 _SLOW_FRACTION = 0.1  # of v_max: a deviation relative to a slower flow is not meaningful
 
@@ -222,7 +220,7 @@ class HealthMonitor:
         line = min(0.5 * amplitude**2 / float(power[strongest]), 1.0) if power[strongest] > 0.0 else 0.0
         nis_std = self.nis_sigma * math.sqrt(2.0 * weight)
         levels = {  # relative to the thresholds
-            Alarm.NIS: (nis - _EXPECTED_NIS) / nis_std if weight > 0.0 else 0.0,
+            Alarm.NIS: (nis - EXPECTED_NIS) / nis_std if weight > 0.0 else 0.0,
             Alarm.PULSATION: min(amplitude / self.pulsation_share, line / self.line_share, settled_s / self.settle_s),
             Alarm.TRACKING: lost / self.lost_share,
         }
@@ -249,7 +247,7 @@ class HealthMonitor:
 
 
 def _first_health(stamp_ns: int, bank: Floats) -> Health:
-    return Health(stamp_ns, "", _EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0)
+    return Health(stamp_ns, "", EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0)
 
 
 @compiled

@@ -36,8 +36,8 @@ from flowrec.stages.estimation.process_model import (
 _NONE = np.zeros(0)
 # One sigma before anything was measured, in um, and as fractions of v_max per radius and of um_per_rev.
 _UNKNOWN_UM = 1e4
-_UNKNOWN_GRADIENT = 0.2
-_UNKNOWN_GAIN = 0.15
+_UNKNOWN_GRADIENT = 0.2  # standard deviation of the flow's gradient before a measurement, in top speeds per radius
+_UNKNOWN_GAIN = 0.15  # the same of um_per_rev, relative
 _GAIN_DRIFT = 0.005  # of um_per_rev, one sigma within a second
 _REST_FRACTION = 0.05  # of v_max: displacement of a robot at rest that counts, as no flow is perfectly steady
 _SLOWEST_FRACTION = 1.0 / 6.0  # of v_max: changes of a slower flow are those of this speed

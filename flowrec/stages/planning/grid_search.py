@@ -26,7 +26,7 @@ from flowrec.stages.planning.path_refinement import refined_route
 from flowrec.stages.planning.problem import Problem
 from flowrec.stages.planning.route import no_route, too_fast
 
-LENGTH, TRAVEL_TIME, PAPER = 0, 1, 2
+LENGTH, TRAVEL_TIME, PAPER = 0, 1, 2  # costs of a step, as above; numbers, because compiled code compares them
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ HELD_BACK = "held back"
 FEWEST = 16  # observations: frequency, amplitude and phase along two axes on top of the flow
 SLOWEST_HZ, FASTEST_HZ = 0.5, 15.0  # slower is a wander; above half the rate of a usual camera the image shows an alias
 STEP = 0.2  # of the frequencies that are tried, over the time that was observed: finer than its resolution
-MOST = 2000
+MOST = 2000  # frequencies, which bounds the time of the search in a long run
 TRIALS = (1.0, 3.0, 10.0)  # amplitudes at which frequencies are compared, in typical standard deviations of the noise
 ALIKE = 1.0  # in ln evidence
 # Assumptions: an observation every fifth of a second is usual, and a robot that slips does so for a second or less.

@@ -41,7 +41,7 @@ DOUBTED = (
 )
 FAR_PX = 0.5  # by which an observation is moved at least: over less, the flow is linear
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
-NOISIER = 1.3  # noise over the stated one from which on a shaking stage is tried
+NOISIER = 1.3  # noise over the stated one from which on it is reported, and a shaking stage is tried
 WORTH_A_SHAKE = 8.0  # in ln evidence, at the best of some hundred independent frequencies
 LINE_TRIALS = (0.03, 0.1, 0.3)  # amplitudes at which frequencies are compared
 FIELD_EFFECTS = (

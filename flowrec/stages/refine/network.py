@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from flowrec.stages.refine.network_inputs import INPUTS, OUTPUTS
 
-LEVELS = 4
+LEVELS = 4  # of the U-Net, each half as fine as the one before
 
 
 class ConvBlock(nn.Module):

@@ -23,7 +23,7 @@ from flowrec.stages.refine.case import Case
 
 INPUTS = 12  # channels of `NetworkInputs.with_observations`
 GAIN, FREE, PRESSURE, LOG_STD = slice(0, 1), slice(1, 3), slice(3, 4), slice(4, 5)  # of a trained network's output
-OUTPUTS = 5
+OUTPUTS = 5  # channels of a trained network, those of the line above
 WINDOW = 5  # pixels around, for the amplitude of pixels at walls
 LEAST_SPEED = 0.05  # of V: a branch without assumed flow can still be given a flow
 

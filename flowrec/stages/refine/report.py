@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import Floats
 from flowrec.physics import Chip
-from flowrec.stages.refine.hypothesis import NOISE, HypothesisFit
+from flowrec.stages.refine.hypothesis import NOISE, NOISIER, HypothesisFit
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.prior import Prior
 
@@ -18,7 +18,6 @@ WEAK = 0.6  # ratio above which it is tested whether openings are observed toget
 OBSERVED_TOGETHER = 0.4  # ratio of their sum below which they are
 FAR = 3.0  # prior standard deviations from the assumed value
 OUTLIER = 0.5  # inlier probability below which an observation counts as an outlier
-NOISIER = 1.3  # times the stated noise
 LEAST_GAIN = 1.0  # in ln evidence over the assumed flow
 
 

@@ -21,12 +21,12 @@ RIM_RATIO = 0.35  # brightness of the rim relative to the disc's darkness, where
 _STEEPNESS = 2.2  # of the outline
 _RIM_POSITION, _RIM_WIDTH = 2.0, 1.1  # in edge widths outside the outline
 _X, _Y, _RADIUS, _EDGE, _LEVEL, _SLOPE_X, _SLOPE_Y, _DARKNESS, _RIM = range(9)
-_PARAMETERS = 9
-_ITERATIONS = 10
+_PARAMETERS = 9  # those above
+_ITERATIONS = 10  # at most, of the damped Gauss-Newton
 _NEAR_PX, _CONVERGED_PX = 0.1, 4e-3  # lengths of a step
 # The square of Cauchy's constant in variances of the residuals: 2.385^2 for normal ones.
 _CAUCHY = 6.0
-_LARGE = 1e200
+_LARGE = 1e200  # before the product of many factors overflows, its logarithm is taken
 
 
 @compiled

@@ -48,8 +48,9 @@ _STEP_RADIUS_PX = 6.0  # least radius in the reduced image
 CENTROID_RADII = 1.15  # window of the centroid
 _LEAST_ENERGY = 3.0  # of a candidate, in units of the noise's variance
 _NEAR, _ALL = 12, 64  # candidates that are measured near the robot, and in a whole image
+# Costs of an assignment, as -ln of its likelihood.
 _SIMILARITY_COST, _MOTION_COST, _MISSED_COST, _IMPOSSIBLE = 8.0, 1.5, 9.0, 1e3
-_NEIGHBOUR_MISSED_COST = 6.0
+_NEIGHBOUR_MISSED_COST = 6.0  # the same of a neighbour that is not seen again
 ENERGY_SPREAD = 0.7  # of ln(energy / expected energy)
 _ISOLATED_RADII = 2.2  # no neighbour is nearer
 _KNOWN_LOOK = 0.8  # correlation from which on a look is one of the views

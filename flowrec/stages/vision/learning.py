@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from flowrec.core import Appearance, Floats, Image
+from flowrec.core import STD_PER_MAD, Appearance, Floats, Image
 from flowrec.stages.vision.foreground import energy_map, patch_at, peaks, silhouette_centroid
 from flowrec.stages.vision.learned import (
     CENTROID_RADII,
@@ -20,7 +20,6 @@ from flowrec.stages.vision.learned import (
 )
 
 _QUANTUM = 0.29  # standard deviation of rounding to whole grey levels, 1 / sqrt(12)
-_STD_OF_MEDIAN = 1.4826  # standard deviation over the median of the absolute value, of normal numbers
 _SMOOTHED = 0.375  # noise of a foreground's block relative to that of a block's mean
 _CLUTTER = 0.5  # other objects and texture are noise, too: this part of the foreground's usual size
 _SAMPLES = 200_000  # pixels from which the noise is taken
@@ -115,7 +114,7 @@ def _foreground(view: View) -> tuple[ForegroundRegion, float, float]:
     """The foreground of a whole image, and the noise of a pixel and of the foreground in grey levels."""
     scale, pixel = scale_of(view.radius_px), pixel_noise(view.image)
     whole = view.whole(scale)
-    usual = _STD_OF_MEDIAN * float(np.median(np.abs(whole.c)))
+    usual = STD_PER_MAD * float(np.median(np.abs(whole.c)))
     return whole, pixel, max(_SMOOTHED * pixel / scale.step, _CLUTTER * usual)
 
 

@@ -20,7 +20,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Background, Floats, Frame, Image, Range, Shift, Track
+from flowrec.core import NS_PER_S, STD_PER_MAD, TUKEY, Background, Floats, Frame, Image, Range, Shift, Track
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.learning import pixel_noise
 from flowrec.stages.vision.walls import walls_in_view
@@ -31,12 +31,11 @@ _BORDER_PX = 4  # pixels nearer to the border would leave the image with most sh
 _LEAST_GRADIENT = 4.5  # of a pixel that is used, in standard deviations: one in 25,000 has it by noise alone
 # Variance of a gradient by Scharr's operator (cv2.Scharr / 32) for a pixel's noise of variance 1.
 _GRADIENT_NOISE = 236.0 / 1024.0
-_LEAST_PIXELS = 60
+_LEAST_PIXELS = 60  # with fewer no shift is measured
 _LEAST_STRUCTURE = 4.0  # mean squared gradient along a direction, in units of that of noise alone
 _WALL_PX = 2.0  # half the width of the image of a wall: farther in the fluid there are bodies that move
-_ITERATIONS = 8
+_ITERATIONS = 8  # at most, of the reweighted fit
 _CONVERGED_PX = 0.002
-_TUKEY = 4.685  # standard deviations from which on a pixel has no weight: 95 % efficient for normal noise
 _AGREES, _AGREES_PX = 3.0, 0.5  # standard deviations of the noise, and px of shift, by which a pixel that agrees is off
 _LEAST_ALIKE = 0.5  # share of the pixels that agree with the reference
 _LESS_ALIKE = 0.1  # than the image before: the whole range is searched
@@ -163,8 +162,8 @@ def _fit(image: Image, pixels: Floats, noise: float, start_px: Floats, direction
         seen, inside = _levels(image, pixels[:, :2] + shift_px)
         residual = seen - gain * known
         residual -= np.median(residual[inside]) if inside.any() else 0.0
-        scale = 1.4826 * float(np.median(np.abs(residual[inside]))) if inside.any() else 0.0
-        weights = np.clip(1.0 - (residual / max(_TUKEY * scale, 1e-6)) ** 2, 0.0, None) ** 2 * inside
+        scale = STD_PER_MAD * float(np.median(np.abs(residual[inside]))) if inside.any() else 0.0
+        weights = np.clip(1.0 - (residual / max(TUKEY * scale, 1e-6)) ** 2, 0.0, None) ** 2 * inside
         weighted = design * weights[:, None]
         normal = design.T @ weighted
         solution = np.linalg.lstsq(normal, weighted.T @ seen, rcond=1e-12)[0]

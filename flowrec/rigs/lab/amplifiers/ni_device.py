@@ -18,9 +18,10 @@ from flowrec.core import RigError
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.stages import AmplifierSettings
 
-_COILS = 3
+_COILS = 3  # x, y and z, a channel each
 _CONNECT_S = 10.0
 UNDERFLOWS = (-200290, -200621, -200018, -200016)  # of the buffer in the computer, and of those in devices
+# Codes of NI-DAQmx (NIDAQmx.h).
 _NO_DEVICE, _NO_CHANNEL, _RESERVED = (-200220, -201003), (-200170,), (-50103, -200022)
 
 

@@ -29,7 +29,7 @@ from flowrec.rigs.lab.amplifiers.waveform import Waveform
 from flowrec.stages import FieldCommand
 
 BLOCK_S = 0.05
-BLOCKS_AHEAD = 2
+BLOCKS_AHEAD = 2  # in the device's buffer: with one, a late block would end the output
 LATENCY_S = (BLOCKS_AHEAD + 0.5) * BLOCK_S  # mean time from an order to its samples
 _REST = FieldCommand()
 

@@ -39,13 +39,12 @@ if TYPE_CHECKING:
     from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
 _BOOT_S = 4.0  # many boards start anew when their port is opened
-_ASK_S = 0.25
-_CONFIRM_S = 0.25
+_CONFIRM_S = 0.25  # for the answer to one line
 _CONFIGURE_S = 2.0
 _SILENT_S = 0.4  # a board that answers no command for so long does not answer
 _LEAST_S = 0.008  # between two lines: a line and its answer take that long at 115200 baud
-_TURNS = 1e-6
-_WRAP = 1 << 32
+_TURNS = 1e-6  # the controller counts millionths of a revolution
+_WRAP = 1 << 32  # its counters have 32 bits
 
 
 class SerialAmplifier:
@@ -202,7 +201,7 @@ class SerialAmplifier:
         answer: Reply | None = None
         while answer is None and time.monotonic() < end_s:
             self._write(ZERO)
-            answer = self._ask("I", timeout_s=_ASK_S)
+            answer = self._ask("I")
             if self._fault:
                 raise RigError(self._fault)
         if answer is None and self._heard_s:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from flowrec.stages import Coils, FieldCommand, field_limits
 
 ZERO = b"\nZ\n"  # the newline ends a line that its writer may have left half written
-VERSION = 1
-_MILLION = 1_000_000
-_INT32 = 2**31 - 1
+VERSION = 1  # of the protocol; a board with another one is refused
+_MILLION = 1_000_000  # revolutions and amperes are integers, in millionths
+_INT32 = 2**31 - 1  # largest integer that a controller reads
 _TURN_RAD = 2.0 * math.pi
 
 

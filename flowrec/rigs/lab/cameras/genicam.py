@@ -13,7 +13,7 @@ from typing import Any
 
 import viva_genicam as vg
 
-from flowrec.core import RigError
+from flowrec.core import NS_PER_S, RigError
 from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Wanted, find_device
 from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
@@ -21,7 +21,6 @@ _DISCOVER_MS = 500
 _GIGE = "gige"
 # Bootstrap registers of GigE Vision: serial number (text), frequency of the clock, and who controls the camera.
 _SERIAL, _TICKS_HIGH, _CONTROL = (0x00D8, 16), (0x093C, 8), (0x0A00, 4)
-_NS = 1e9  # the clock of a USB3 Vision camera counts ns
 
 
 class GenicamCamera(Camera):
@@ -171,7 +170,7 @@ def _look(device: vg.GigeDeviceInfo) -> tuple[str, bool]:
 def _ticks_per_s(camera: vg.Camera, nodes: _GenicamNodes) -> float:
     """Frequency of the camera's clock, as it states it."""
     if camera.transport != _GIGE:
-        return _NS
+        return NS_PER_S  # the clock of a USB3 Vision camera
     stated = nodes.value("GevTimestampTickFrequency")
     if isinstance(stated, int) and stated > 0:
         return float(stated)

@@ -14,16 +14,15 @@ with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "builtin type .* has no __module__ attribute", DeprecationWarning)
     from pypylon import genicam, pylon
 
-from flowrec.core import RigError
+from flowrec.core import NS_PER_S, RigError
 from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Wanted, find_device
 from flowrec.rigs.lab.cameras.features import ABSENT, Feature, Features, Value, configure
 
-_BUFFERS = 32
+_BUFFERS = 32  # for images that wait to be grabbed: 0.3 s at 100 Hz
 _EMULATOR = "BaslerCamEmu"
 _GIGE = "BaslerGigE"
 _READY_MS = 100  # until a camera takes the next trigger
-_NO_ID = (1 << 64) - 1
-_NS = 1e9  # the clock of a USB camera counts ns
+_NO_ID = (1 << 64) - 1  # pylon's number of an image that has none
 
 
 class PylonCamera(Camera):
@@ -75,7 +74,7 @@ class PylonCamera(Camera):
             model=f"{about.GetVendorName()} {about.GetModelName()}",
             serial=about.GetSerialNumber(),
             id_bits=features.id_bits(about.GetDeviceClass() == _GIGE),
-            ticks_per_s=0.0 if self._emulated else float(features.value("GevTimestampTickFrequency") or _NS),
+            ticks_per_s=0.0 if self._emulated else float(features.value("GevTimestampTickFrequency") or NS_PER_S),
         )
 
     def grab(self, timeout_s: float) -> Grabbed | None:
