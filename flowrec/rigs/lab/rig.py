@@ -249,7 +249,7 @@ class LabRig:
 
     def _field_between(self, session: _Session, stamp_ns: int, before_ns: int | None) -> Applied:
         if self.drive is None:
-            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(self._config.coils.count), np.zeros(2))
         begin_ns = None if before_ns is None else session.monotonic_ns(before_ns)
         return replace(self.drive.applied_at(session.monotonic_ns(stamp_ns), begin_ns), stamp_ns=stamp_ns)
 

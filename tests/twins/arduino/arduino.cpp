@@ -1,7 +1,7 @@
 // Runs a sketch on a computer, with its outputs as a file of samples.
 //
 //   twin pty FILE      in real time, behind a pseudo terminal whose name is printed. FILE gets a record for each change of
-//                      the outputs: int64 CLOCK_MONOTONIC in ns, 3 doubles (coils, as fractions of the full scale).
+//                      the outputs: int64 CLOCK_MONOTONIC in ns, TWIN_COILS doubles (fractions of the full scale).
 //   twin clock FILE    by the clock of the caller. On stdin: "> LINE" hands a line over, "+ US" lets time pass. What the
 //                      sketch sends is printed; each "+" is answered with ".". FILE gets a record for every loop().
 #include "Arduino.h"
@@ -72,9 +72,9 @@ size_t SerialPort::write(const uint8_t *bytes, size_t count) {
 static void record() {
   struct {
     int64_t at_ns;
-    double coils[3];
-  } now = {real_time ? monotonic_ns() : clock_us * 1000, {0, 0, 0}};
-  for (int c = 0; c < 3; c++) now.coils[c] = (level[5 + c] ? -1.0 : 1.0) * duty[2 + c] / PWM_FULL;
+    double coils[TWIN_COILS];
+  } now = {real_time ? monotonic_ns() : clock_us * 1000, {0}};
+  for (int c = 0; c < TWIN_COILS; c++) now.coils[c] = (level[2 + TWIN_COILS + c] ? -1.0 : 1.0) * duty[2 + c] / PWM_FULL;
   fwrite(&now, sizeof now, 1, samples);
   changed = false;
 }

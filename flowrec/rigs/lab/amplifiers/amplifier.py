@@ -43,7 +43,7 @@ class AmplifierInfo:
 
 
 class Amplifier(Protocol):
-    """Three coil amplifiers behind one device. No method but `open`, `zero` and `close` blocks."""
+    """The amplifiers of all coils behind one device. No method but `open`, `zero` and `close` blocks."""
 
     def open(self) -> AmplifierInfo:
         """Find the device and take its outputs to zero. It stays disarmed: no command makes a field.

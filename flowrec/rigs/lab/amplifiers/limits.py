@@ -133,8 +133,8 @@ class CommandLimits:
 
         Parameters
         ----------
-        currents_a : (n + 1, 3), the first one that of the sample before.
-        voltages_v : (n, 3)
+        currents_a : (n + 1, coils), the first one that of the sample before.
+        voltages_v : (n, coils)
 
         Raises
         ------
@@ -148,7 +148,7 @@ class CommandLimits:
 
     @property
     def _turning_a_s(self) -> NDArray[np.float64]:
-        """(3,) largest rate of change of the currents while the amplitude is constant."""
+        """(coils,) largest rate of change of the currents while the amplitude is constant."""
         turning: NDArray[np.float64] = (
             field_limits(self.coils).row_a_per_mt * self.amplitude_mt * _TURN_RAD * self.rotation_hz
         )

@@ -17,6 +17,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
 import serial
 from serial.tools import list_ports
 
@@ -46,6 +47,7 @@ _SILENT_S = 0.4  # a board that answers no command for so long does not answer
 _LEAST_S = 0.008  # between two lines: a line and its answer take that long at 115200 baud
 _TURNS = 1e-6
 _WRAP = 1 << 32
+_COILS = 3  # of a firmware that does not state their number
 
 
 class SerialAmplifier:
@@ -86,7 +88,8 @@ class SerialAmplifier:
         self._zeros = 0  # confirmations of Z
         self._answered = threading.Condition()
         # The log, for the loop's thread only.
-        self._log = FieldLog()
+        self._log = FieldLog(coils=coils.count)
+        self._no_field = Telemetry(0, 0.0, 0.0, 0.0, (0, 0), np.zeros(coils.count))
         self._clock = DeviceClock(unit=1000.0, wrap=_WRAP)
         self._fit: Fit | None = None
         self._round_trip_ns = math.inf
@@ -160,7 +163,7 @@ class SerialAmplifier:
                 raise RigError(f"{self._name}: the amplifier can not be reached ({error})") from error
             with self._answered:
                 if self._answered.wait_for(lambda seen=before: self._zeros > seen, _CONFIRM_S):  # type: ignore[misc]
-                    self._measured.append((_NO_FIELD, time.monotonic_ns(), 0))
+                    self._measured.append((self._no_field, time.monotonic_ns(), 0))
                     return
         raise RigError(f"{self._name}: the amplifier does not confirm that it is at zero")
 
@@ -212,23 +215,28 @@ class SerialAmplifier:
                 f"{self._name}: no answer in {_BOOT_S:g} s; is the firmware on the board, lab.serial.baud right?"
             )
         try:
-            model, version, most_ua, timer_ms, update_hz = answer.words
-            found = int(version), int(most_ua), int(timer_ms), int(update_hz)
+            model, *numbers = answer.words
+            version, most_ua, timer_ms, _update_hz, coils = map(int, (*numbers, str(_COILS))[:5])
         except ValueError as error:
             raise RigError(
                 f"{self._name}: another device than flowrec-coils answers (by {_words(answer)!r}); is lab.serial.port "
                 "right?"
             ) from error
-        if found[0] != VERSION:
-            raise RigError(f"{self._name}: protocol {found[0]}, where {VERSION} is needed; put the new firmware on it")
+        if version != VERSION:
+            raise RigError(f"{self._name}: protocol {version}, where {VERSION} is needed; put the new firmware on it")
+        if coils != self._coils.count:
+            raise UsageError(
+                f"{self._name}: the firmware drives {coils} coils, where coils.mt_per_a has {self._coils.count} "
+                "columns; give that one column a coil, or the sketch the pins of all coils (PWM_PINS, DIR_PINS)"
+            )
         return AmplifierInfo(
             model=model,
             serial="",
-            max_current_a=1e-6 * found[1],
+            max_current_a=1e-6 * most_ua,
             max_voltage_v=math.inf,
             max_output_hz=math.inf,
             latency_s=0.01,
-            timer_s=1e-3 * found[2],
+            timer_s=1e-3 * timer_ms,
         )
 
     def _ask(self, verb: str, *numbers: int, timeout_s: float = _CONFIRM_S) -> Reply | None:
@@ -314,7 +322,7 @@ class SerialAmplifier:
 
     def _take(self, now: Telemetry, sent_ns: int, arrival_ns: int) -> None:
         """Add an answer to the log, and the mean of the time between the last answer and this one."""
-        if now is _NO_FIELD:
+        if now is self._no_field:
             self._append(sent_ns, now)
             self._before = None
             return
@@ -338,9 +346,6 @@ class SerialAmplifier:
         self._log.append(
             not_before(self._log, stamp_ns), now.frequency_hz, now.heading_rad, now.amplitude_mt, now.currents_a
         )
-
-
-_NO_FIELD = Telemetry(0, 0.0, 0.0, 0.0, (0, 0), FieldLog().at(0).currents_a)
 
 
 def _signed_difference(difference: int) -> int:

@@ -41,7 +41,7 @@ class Telemetry:
     heading_rad: float  # direction in which the robot travels
     amplitude_mt: float
     turns: tuple[int, int]  # 1e-6 revolutions along x and y since the board started; wrap at 2^32
-    currents_a: NDArray[np.float64]  # (3,)
+    currents_a: NDArray[np.float64]  # (coils,)
 
 
 def line(verb: str, number: int, *numbers: int) -> bytes:
@@ -67,8 +67,6 @@ def telemetry(answer: Reply) -> Telemetry | None:
     try:
         clock, mhz, heading, ut, _phase, _plane, x, y, *currents = (int(word) for word in answer.words)
     except ValueError:
-        return None
-    if len(currents) != 3:
         return None
     heading_rad = heading / _MILLION * _TURN_RAD
     return Telemetry(clock, 1e-3 * mhz, heading_rad, 1e-3 * ut, (x, y), np.array(currents) / _MILLION)
