@@ -25,7 +25,7 @@ from flowrec.stages.rig_settings import OutputLimits
 from tests.twins.coils import channels
 
 COILS = Coils(bias_mt=(0.05, 0.0, -0.04))
-# Three pairs that are not quite alike. At 2.1 A the currents of least norm make 3.73 mT in any direction; 4 are possible.
+# Three pairs that are not quite alike. At 2.1 A currents of least norm make 3.73 mT in any direction; 4 are possible.
 SIX_COILS = Coils(
     mt_per_a=((1.3, 0.8, 0.1, -0.1, 0.05, 0.0), (0.1, -0.05, 0.9, 1.1, 0.0, 0.1), (0.0, 0.1, -0.05, 0.05, 1.0, 1.1)),
     bias_mt=(0.05, 0.0, -0.04),

@@ -1,4 +1,4 @@
-"""Twin of an NI gRPC Device Server with a cDAQ and a module in it: `python -m tests.twins.ni FILE [COILS]` prints its port.
+"""Twin of an NI gRPC Device Server with a module of a cDAQ: `python -m tests.twins.ni FILE [COILS]` prints its port.
 
 The client is NI's own package. What is modelled: buffers that are put out at the sample clock and, with regeneration
 off, run dry (-200290); values outside the range (-200077); outputs that another task has reserved (-50103); names that

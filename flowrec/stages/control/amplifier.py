@@ -16,7 +16,7 @@ WORST_CONDITION = 1e3  # largest condition number of the matrix mt_per_a that is
 _TURN_RAD = 2.0 * math.pi
 _H_PER_MH = 1e-3
 _MOST_ROUNDS = 200  # of the weights of coils; the amplitude of six coils rises by less than 0.1 % in the last 100
-_LEAST_SHARE = 1e-9  # of a coil that the field does not need
+_LEAST_SHARE = 1e-6  # of a coil that the field does not need
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +139,8 @@ def shared_inverse(matrix: Floats, limits_of: Callable[[Floats], FieldLimits]) -
     ----------
     limits_of : the limits of a G.
     """
-    best: Floats = np.linalg.pinv(matrix)
-    inverse = best
+    least_norm: Floats = np.linalg.pinv(matrix).astype(np.float64)
+    best = inverse = least_norm
     most_mt, shares = -math.inf, None
     for _ in range(_MOST_ROUNDS):
         limits = limits_of(inverse)
@@ -155,6 +155,7 @@ def shared_inverse(matrix: Floats, limits_of: Callable[[Floats], FieldLimits]) -
         shares /= shares.sum()
         weighted = (limit_a**2 / shares)[:, None] * matrix.T
         inverse = weighted @ np.linalg.inv(matrix @ weighted)
+        inverse = inverse + least_norm @ (np.eye(len(matrix)) - matrix @ inverse)  # A G = 1 but for rounding
     return best
 
 

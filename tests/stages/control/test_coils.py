@@ -3,7 +3,7 @@ from itertools import groupby
 
 import numpy as np
 import pytest
-from scipy.optimize import lsq_linear
+from scipy.optimize import linprog
 
 from flowrec.core.errors import UsageError
 from flowrec.core.messages import Currents, Demand
@@ -187,16 +187,16 @@ def drawn_coils(seed, count, **more):
 
 @pytest.mark.parametrize("count", [4, 6, 8])
 def test_of_more_than_three_coils_those_currents_are_taken_whose_sum_of_squares_is_least(count):
-    coils = drawn_coils(1, count, max_current_a=50.0)
+    coils = drawn_coils(1, count, max_current_a=50.0, amplifier=AmplifierSettings(a_per_v=10.0))
     field = 4.0 * in_all_directions()
     least = np.linalg.lstsq(np.array(coils.mt_per_a), (field - BIAS).T)[0].T
     np.testing.assert_allclose(coils.currents_a(field, np.full(len(field), 4.0)), least, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("count", [4, 6, 8])
 def test_where_a_coil_would_exceed_its_limit_the_others_take_over_within_theirs(count, seed):
-    """Least squares with bounds, direction by direction, is what could be done at best: no map has to be linear."""
+    """The best of all is a linear program for each direction: the longest field there that bounded currents make."""
     coils = drawn_coils(seed, count, amplitude_mt=4.0, max_current_a=1.0)
     matrix, directions = np.array(coils.mt_per_a), in_all_directions()
     full_mt = coils.full_mt(ROBOT)
@@ -206,9 +206,13 @@ def test_where_a_coil_would_exceed_its_limit_the_others_take_over_within_theirs(
     least_norm = np.linalg.pinv(matrix)
     rows, bias_a = np.linalg.norm(least_norm, axis=1), np.abs(least_norm @ BIAS)
     assert full_mt >= min(((1.0 - bias_a) / rows).min(), 4.0) - 1e-9, "never less than with the pseudo-inverse"
-    made = [lsq_linear(matrix, 4.0 * d - BIAS, (-1.0, 1.0)).x @ matrix.T + BIAS for d in directions[::10]]
-    bounded_mt = np.einsum("ij,ij->i", made, directions[::10]).min()
-    assert full_mt >= 0.85 * bounded_mt
+    longest = [0.0] * count + [-1.0]
+    bounds = [(-1.0, 1.0)] * count + [(0.0, 4.0)]
+    best_mt = min(
+        linprog(longest, A_eq=np.column_stack([matrix, -d]), b_eq=-np.array(BIAS), bounds=bounds).x[-1]
+        for d in directions[::10]
+    )
+    assert full_mt >= 0.85 * best_mt
 
 
 def test_a_field_of_six_coils_turns_as_that_of_three_and_what_is_missing_of_it_is_stated():
