@@ -24,6 +24,7 @@ from flowrec.stages.control.field_rotation import FieldCommand, FieldState, fiel
 _Row = tuple[float, ...]
 _Matrix = tuple[_Row, _Row, _Row]
 _AXES = 3
+_LEAST_ROW = 1e-9  # A per mT of a coil that makes no field, such as a Maxwell pair
 _PER_COIL = ("a_per_v", "v_per_v", "resistance_ohm", "inductance_mh")  # settings of [coils.amplifier]
 _FADE_FRACTION = 0.1  # below this fraction of the full amplitude the bias compensation fades with the field
 
@@ -267,7 +268,7 @@ def field_limits(coils: Coils) -> FieldLimits:
 def _limits_with(coils: Coils, inverse: Floats) -> FieldLimits:
     """The limits if the currents of a field are those of a matrix (n, 3), A per mT."""
     bias_a = inverse @ np.array(coils.bias_mt)
-    row = np.linalg.norm(inverse, axis=1)
+    row = np.maximum(np.linalg.norm(inverse, axis=1), _LEAST_ROW)
     ohm, henry = (np.broadcast_to(each, coils.count) for each in (coils.amplifier.ohm, coils.amplifier.henry))
     # While the amplitude ramps, and the bias compensation with it, L di/dt is larger by at most this.
     a_per_mt_ramp = row + np.abs(bias_a) / coils.fade_mt
