@@ -166,7 +166,7 @@ def flow_text(figures: Mapping[str, Value]) -> str:
 
 
 def _unmet_text(figures: Mapping[str, Value]) -> str:
-    """What the coils could not do of the field that was asked for; '' if they did all."""
+    """Sentence on the amplitude that the coils could not make; '' if they made all of it."""
     missing = figures.get("unmet_mt")
     if not missing:
         return ""

@@ -50,7 +50,7 @@ class Excitations(NamedTuple):
 
     @property
     def good_set(self) -> str:
-        """What is recommended, in words."""
+        """The rows that are recommended, in words."""
         every = "all three" if len(self.coils) == 3 else f"all {len(self.coils)}"
         return f"{self.good_rows} are recommended: each coil alone with both signs, then some of {every} at once"
 
