@@ -75,7 +75,7 @@ class Coils:
         heading = previous.heading_rad if previous is not None else 0.0
         if speed_um_s > 1e-6:
             heading = math.atan2(demand.velocity_um_s[1], demand.velocity_um_s[0])
-        frequency_hz = min(speed_um_s / robot.um_per_rev, limit_hz)
+        frequency_hz = min(robot.frequency_hz(speed_um_s / robot.um_per_rev), limit_hz)
         state = FieldState(now.phase_rad, now.plane_rad if now.amplitude_mt > 0.0 else heading, amplitude_mt)
         command = FieldCommand(frequency_hz, heading, amplitude_mt, limit_hz, self.ramp_mt_s)
         currents_a, voltages_v = self._outputs_now(state, command)
@@ -99,7 +99,13 @@ class Coils:
 
     def fastest_um_s(self, robot: Robot) -> float:
         """Speed of the robot at the highest frequency at which it follows that amplitude."""
-        return robot.um_per_rev * _follow_hz(robot) * min(self.full_mt(robot) / self.amplitude_mt, 1.0)
+        if not robot.speed_at_hz:
+            return robot.um_per_rev * _follow_hz(robot) * min(self.full_mt(robot) / self.amplitude_mt, 1.0)
+        return robot.um_per_rev * robot.proportional_hz(self.fastest_hz(robot))
+
+    def fastest_hz(self, robot: Robot) -> float:
+        """The highest frequency of the field at which the robot follows that amplitude."""
+        return _follow_hz(robot) * min(self.full_mt(robot) / self.amplitude_mt, 1.0)
 
     @property
     def count(self) -> int:

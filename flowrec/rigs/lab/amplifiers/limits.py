@@ -42,7 +42,7 @@ class CommandLimits:
     ) -> None:
         self.coils, self.output, self.tell = coils, output, tell
         self.amplitude_mt = coils.full_mt(robot)
-        self.rotation_hz = coils.fastest_um_s(robot) / robot.um_per_rev
+        self.rotation_hz = coils.fastest_hz(robot)
         self.on_left_s = output.longest_on_s
         self._resting = False
         self._last: tuple[int, bool] | None = None  # time of the last command; with a field?
