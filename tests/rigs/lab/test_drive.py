@@ -26,7 +26,7 @@ from flowrec.stages.rig_settings import OutputLimits
 from tests.conftest import needs_quiet, until
 from tests.extras import why
 from tests.perf.guardian import sleeper, trial
-from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, amplifier, coils_of, currents
+from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, SIX_COILS, amplifier, coils_of, currents
 from tests.twins.coils import Device, channels, device
 
 pytestmark = needs_quiet
@@ -254,6 +254,8 @@ def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
         (amplifier("serial", str(tmp_path / "ttyNone")), COILS, "ports here"),
         (amplifier("serial", serial.address), strong, "coils.max_current_a = 7 A: flowrec-coils makes at most 5 A"),
         (amplifier("ni", "127.0.0.1:1"), COILS, "no NI gRPC Device Server"),
+        (amplifier("serial", serial.address, coils=SIX_COILS), SIX_COILS, "drives 3 coils, where coils.mt_per_a has 6"),
+        (amplifier("ni", ni.address, coils=SIX_COILS), SIX_COILS, "the device has no such output"),
     ]
     for given, coils, words in cases:
         with (
