@@ -36,7 +36,7 @@ from .interpolation import (
     corner_weights as corner_weights, nearest_pixel as nearest_pixel, nearest_pixels as nearest_pixels,
 )
 from .messages import (
-    Appearance as Appearance, Applied as Applied, AxesCheck as AxesCheck, Background as Background,
+    Appearance as Appearance, Applied as Applied, Measured as Measured, AxesCheck as AxesCheck, Background as Background,
     Currents as Currents, Demand as Demand, Estimate as Estimate, Event as Event, FlowField as FlowField,
     Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,

@@ -30,6 +30,7 @@ from flowrec.core import (
     Floats,
     FlowField,
     Frame,
+    Measured,
     Message,
     Observations,
     OperatorEvent,
@@ -82,6 +83,7 @@ class Inputs:
     shift: Shift | None = None  # likewise
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
     losses: CameraLosses | None = None  # of the camera so far, for the record only
+    measured: Measured | None = None  # currents of the coils, by an amplifier that measures them; for the record only
     extra: Mapping[str, Message] = NO_EXTRA  # new messages of the extra topics of rig and simulator, by path
 
 

@@ -74,14 +74,17 @@ def _programs() -> TemporaryDirectory[str]:
 
 @contextmanager
 def device(kind: str, folder: Path, timer_ms: int = 100, coils: int = 3) -> Iterator[Device]:
-    """`serial`: the firmware's own timer is off, so that the guardian is alone; `serial+timer`; `ni`.
+    """`serial`: the firmware's own timer is off, so that the guardian is alone; `serial+timer`; `ni`. `serial+sensors`
+    measures its currents; while there is a file `fault` in the folder, its first coil has half of its current.
 
     `folder` gets the file of the outputs.
     """
     file = folder / f"{kind}.samples"
     if kind != "ni":
-        program = compiled(Path(_programs().name), timer_ms if kind.endswith("timer") else 0, coils)
-        with firmware_twin(program, file, coils) as twin:
+        program = compiled(
+            Path(_programs().name), timer_ms if kind.endswith("timer") else 0, coils, kind.endswith("sensors")
+        )
+        with firmware_twin(program, file, coils, folder / "fault") as twin:
             yield Device("serial", twin.port, file, coils)
         return
     command = [sys.executable, "-m", "tests.twins.ni", file, str(coils)]

@@ -19,6 +19,7 @@ SKETCH = Path(flowrec.__file__).parent / "rigs/lab/amplifiers/firmware/flowrec_c
 _SHIM = Path(__file__).parent / "arduino"
 FULL_A = 5.0  # of the outputs
 _PINS = {3: (), 6: ("-DPWM_PINS=2,3,4,5,6,7", "-DDIR_PINS=8,9,10,11,12,13")}
+_SENSORS = {3: "0,1,2", 6: "0,1,2,3,4,5"}
 
 
 def sample(coils: int = 3) -> np.dtype[np.void]:
@@ -26,15 +27,16 @@ def sample(coils: int = 3) -> np.dtype[np.void]:
     return np.dtype([("at_ns", "<i8"), ("coils", "<f8", coils)])
 
 
-def compiled(folder: Path, timer_ms: int = 100, coils: int = 3) -> Path:
+def compiled(folder: Path, timer_ms: int = 100, coils: int = 3, sensors: bool = False) -> Path:
     """The twin's program. With `timer_ms` = 0 the firmware does not go to zero by itself."""
     if shutil.which("g++") is None:
         pytest.skip("needs g++")
-    program = folder / f"twin{timer_ms}_{coils}"
+    program = folder / f"twin{timer_ms}_{coils}_{sensors}"
     if not program.exists():
         made = program.with_name(f"{program.name}.{os.getpid()}")
         options = ["-Wall", "-Wextra", "-Werror", "-O1", f"-DTIMER_MS={timer_ms}", "-DPWM_FULL=1000000", f"-I{_SHIM}"]
-        options += [*_PINS[coils], f"-DTWIN_COILS={coils}"]
+        options += [*_PINS[coils], f"-DTWIN_COILS={coils}", "-DSENSE_ZERO=1000000", "-DSENSE_UA=5L"]
+        options += [f"-DSENSE_PINS={_SENSORS[coils]}"] if sensors else []
         files = ["-include", _SHIM / "Arduino.h", "-x", "c++", SKETCH, _SHIM / "arduino.cpp"]
         subprocess.run(["g++", *options, *files, "-o", made], check=True)
         made.rename(program)
@@ -66,9 +68,10 @@ def read_samples(file: Path, full: float = 1.0, from_byte: int = 0, coils: int =
 
 
 @contextmanager
-def firmware_twin(program: Path, file: Path, coils: int = 3) -> Iterator[FirmwareTwin]:
-    """The firmware behind a pseudo terminal, in real time."""
-    with subprocess.Popen([program, "pty", file], stdout=subprocess.PIPE, text=True) as process:
+def firmware_twin(program: Path, file: Path, coils: int = 3, fault: Path | None = None) -> Iterator[FirmwareTwin]:
+    """The firmware behind a pseudo terminal, in real time. While there is a file `fault`, the first coil has half."""
+    env = os.environ | ({"TWIN_FAULT": str(fault)} if fault else {})
+    with subprocess.Popen([program, "pty", file], stdout=subprocess.PIPE, text=True, env=env) as process:
         try:
             assert process.stdout is not None
             yield FirmwareTwin(process.stdout.readline().strip(), file, process, coils)

@@ -159,6 +159,32 @@ def test_a_board_that_has_gone_to_zero_by_itself_ends_the_run(tmp_path: Path) ->
         assert on.off_ns(0) is not None
 
 
+def test_a_coil_that_has_half_of_its_current_is_noticed_by_its_sensor_and_ends_in_zero(tmp_path: Path) -> None:
+    checked = OutputLimits(measured_within_a=0.3, measured_after_s=0.05)
+    fault = tmp_path / "fault"
+    with (
+        device("serial+sensors", tmp_path) as on,
+        Drive(amplifier("serial", on.address), CommandLimits(COILS, ROBOT, checked), 1.0, 5.0) as drive,
+    ):
+        assert drive.info.measures
+        for _ in range(60):
+            drive.apply(currents(8.0, 0.0))
+            time.sleep(0.015)
+        measured = drive.measured()
+        assert measured is not None and np.abs(measured.currents_a).max() > 1.0
+        np.testing.assert_allclose(measured.currents_a, measured.put_out_a, atol=1e-4)
+        fault.touch()
+        begin_ns = time.monotonic_ns()
+        with pytest.raises(RigError, match=r"flowrec-coils: coil x has .* A where .* A are put out, for \d+ ms"):
+            commanded(drive)
+        assert time.monotonic_ns() - begin_ns < 1e9
+        off_ns = on.off_ns(begin_ns)
+        assert off_ns is not None and (off_ns - begin_ns) * 1e-9 < 0.2 + SLACK_S
+        drive.apply(currents(8.0, 0.0))
+        time.sleep(0.05)
+        assert on.off_ns(begin_ns) == off_ns
+
+
 def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
     begin = on.end()
     with driven(on, 0.4) as (drive, begin_ns, _):

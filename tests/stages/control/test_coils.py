@@ -202,7 +202,7 @@ def test_where_a_coil_would_exceed_its_limit_the_others_take_over_within_theirs(
     full_mt = coils.full_mt(ROBOT)
     currents = coils.currents_a(full_mt * directions, np.full(len(directions), full_mt))
     assert np.abs(currents).max() <= 1.0 + 1e-9
-    np.testing.assert_allclose(currents @ matrix.T + BIAS, full_mt * directions, atol=1e-9)
+    np.testing.assert_allclose(currents @ matrix.T + BIAS, full_mt * directions, atol=1e-12)
     least_norm = np.linalg.pinv(matrix)
     rows, bias_a = np.linalg.norm(least_norm, axis=1), np.abs(least_norm @ BIAS)
     assert full_mt >= min(((1.0 - bias_a) / rows).min(), 4.0) - 1e-9, "never less than with the pseudo-inverse"

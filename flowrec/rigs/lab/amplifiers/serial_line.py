@@ -21,7 +21,17 @@ import numpy as np
 import serial
 from serial.tools import list_ports
 
-from flowrec.core import NS_PER_S, DeviceClock, Fit, Priority, RigError, UsageError, realtime_priority, seconds
+from flowrec.core import (
+    NS_PER_S,
+    DeviceClock,
+    Fit,
+    Measured,
+    Priority,
+    RigError,
+    UsageError,
+    realtime_priority,
+    seconds,
+)
 from flowrec.rigs.lab.amplifiers.amplifier import KEEP_S, AmplifierInfo, not_before
 from flowrec.rigs.lab.amplifiers.serial_protocol import (
     VERSION,
@@ -87,6 +97,7 @@ class SerialAmplifier:
         self._heard_s = 0.0
         self._zeros = 0  # confirmations of Z
         self._answered = threading.Condition()
+        self._read_back: Measured | None = None
         # The log, for the loop's thread only.
         self._log = FieldLog(coils=coils.count)
         self._no_field = Telemetry(0, 0.0, 0.0, 0.0, (0, 0), np.zeros(coils.count))
@@ -149,6 +160,10 @@ class SerialAmplifier:
             self._take(*self._measured.popleft())
         self._log.forget(until_ns - round(KEEP_S * NS_PER_S))
         return self._log
+
+    def measured(self) -> Measured | None:
+        """The latest measurement, at the arrival of its answer."""
+        return self._read_back
 
     def zero(self) -> None:
         self._permitted = self._on = False
@@ -216,7 +231,9 @@ class SerialAmplifier:
             )
         try:
             model, *numbers = answer.words
-            version, most_ua, timer_ms, _update_hz, coils = map(int, (*numbers, str(_COILS))[:5])
+            version, most_ua, timer_ms, _update_hz, coils, sensors = map(
+                int, (numbers + [str(_COILS), "0"][len(numbers) - 4 :])
+            )
         except ValueError as error:
             raise RigError(
                 f"{self._name}: another device than flowrec-coils answers (by {_words(answer)!r}); is lab.serial.port "
@@ -237,6 +254,7 @@ class SerialAmplifier:
             max_output_hz=math.inf,
             latency_s=0.01,
             timer_s=1e-3 * timer_ms,
+            measures=sensors == coils,
         )
 
     def _ask(self, verb: str, *numbers: int, timeout_s: float = _CONFIRM_S) -> Reply | None:
@@ -305,10 +323,12 @@ class SerialAmplifier:
 
     def _hear(self, answer: Reply, arrival_ns: int) -> None:
         self._heard_s = seconds(arrival_ns)
-        measured = telemetry(answer)
+        measured = telemetry(answer, self._coils.count)
         sent_ns, field = self._sent.pop(answer.number, (0, False))
         if measured is not None and sent_ns:
             self._measured.append((measured, sent_ns, arrival_ns))
+            if measured.measured_a is not None:
+                self._read_back = Measured(arrival_ns, measured.measured_a, measured.currents_a)
             return
         if answer.verb == "E" and field:
             why = "no line reached it in time" if "timer" in answer.words else _words(answer)

@@ -42,6 +42,23 @@ static const int COILS = sizeof PWM_PIN / sizeof PWM_PIN[0];
 static_assert(sizeof DIR_PIN == sizeof PWM_PIN, "each coil needs a PWM pin and a direction pin");
 static_assert(COILS >= 3 && COILS <= 12, "a rotating field needs three coils; a line has room for twelve");
 
+// Sensors of the currents, where the board has them: a pin for each coil, the count of analogRead without a current, and
+// microamperes a count. Without SENSE_PINS nothing is measured.
+// #define SENSE_PINS A0, A1, A2
+#ifdef SENSE_PINS
+#ifndef SENSE_ZERO
+#define SENSE_ZERO 2048
+#define SENSE_UA 2500L
+#endif
+static const int SENSE_PIN[] = {SENSE_PINS};
+static const int SENSORS = COILS;
+static_assert(sizeof SENSE_PIN == sizeof PWM_PIN, "each coil needs a sensor, or none has one");
+static int32_t measured_ua(int c) { return (int32_t)(analogRead(SENSE_PIN[c]) - SENSE_ZERO) * SENSE_UA; }
+#else
+static const int SENSORS = 0;
+static int32_t measured_ua(int) { return 0; }
+#endif
+
 static void begin_outputs() {
   for (int c = 0; c < COILS; c++) {
     pinMode(PWM_PIN[c], OUTPUT);
@@ -159,7 +176,7 @@ static void update() {
 static char line[64 + 12 * COILS];
 static uint8_t length = 0;
 static bool overlong = false;
-static char reply[124 + 12 * COILS];
+static char reply[124 + 24 * COILS];
 static char waiting[3 * sizeof reply];  // replies that are not sent yet
 static size_t waiting_count = 0;
 
@@ -259,6 +276,7 @@ static void telemetry(int32_t seq) {
   add_number((int32_t)(uint32_t)(turns_x / 1000000LL));
   add_number((int32_t)(uint32_t)(turns_y / 1000000LL));
   for (int c = 0; c < COILS; c++) add_number((int32_t)current_ua[c]);
+  for (int c = 0; c < SENSORS; c++) add_number(measured_ua(c));
   send();
 }
 
@@ -271,7 +289,8 @@ static void obey(char verb, int32_t seq, const int32_t *given, int count) {
     add_number(MAX_UA);
     add_number(TIMER_MS);
     add_number(1000000L / (long)UPDATE_US);
-    if (COILS != 3) add_number(COILS);
+    if (COILS != 3 || SENSORS) add_number(COILS);
+    if (SENSORS) add_number(SENSORS);
     send();
   } else if (verb == 'V' && count == COILS + 1 && given[0] >= 0 && given[0] < 4 && !armed) {
     for (int c = 0; c < COILS; c++) vector_ua[given[0]][c] = (float)given[c + 1];
