@@ -87,6 +87,8 @@ def test_a_roller_a_helix_and_a_robot_by_a_table_reach_their_goal_and_replay_ide
     sent = [each for each in reader.messages("currents") if 6.0 < each.frequency_hz < 35.0]
     demanded = {each.stamp_ns: np.hypot(*each.velocity_um_s) for each in reader.messages("demand")}
     assert len(sent) > 20
+    own_um_s = [np.hypot(*each.rolled_um_s) for each in reader.messages("estimate")]
+    assert 300.0 < max(own_um_s) <= 560.0, "the observer knows how fast it turns, not how often"
     for each in sent[::5]:
         if each.frequency_hz < 0.999 * each.limit_hz:
             assert BENT.rolled_speed_um_s(each.frequency_hz) == pytest.approx(demanded[each.stamp_ns], rel=1e-6)
