@@ -12,7 +12,7 @@ from .coverage import Coverage as Coverage
 from .declarations import (
     COILS as COILS, Bools as Bools, Floats as Floats, Image as Image, Ints as Ints, Matrix as Matrix, Message as Message, MessageField as MessageField, Role as Role,
     Source as Source, Topic as Topic, array_shapes as array_shapes,
-    as_read as as_read, defaulted_fields as defaulted_fields, invalid_numbers as invalid_numbers,
+    as_read as as_read, coil_names as coil_names, defaulted_fields as defaulted_fields, invalid_numbers as invalid_numbers,
     message_fields as message_fields, shape_error as shape_error, shape_fault as shape_fault,
     summary_of as summary_of,
 )
@@ -36,7 +36,7 @@ from .interpolation import (
     corner_weights as corner_weights, nearest_pixel as nearest_pixel, nearest_pixels as nearest_pixels,
 )
 from .messages import (
-    Appearance as Appearance, Applied as Applied, AxesCheck as AxesCheck, Background as Background,
+    Appearance as Appearance, Applied as Applied, Measured as Measured, AxesCheck as AxesCheck, Background as Background,
     Currents as Currents, Demand as Demand, Estimate as Estimate, Event as Event, FlowField as FlowField,
     Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,

@@ -68,6 +68,11 @@ NanFloat = Annotated[float, Shape(finite=False)]  # a number for which NaN or in
 NOT_STATED: Any = ()  # default of a vector, which the message makes (0,)
 
 
+def coil_names(count: int) -> tuple[str, ...]:
+    """Names of so many coils, as in columns of tables: of three x, y and z, else their numbers from 1."""
+    return ("x", "y", "z") if count == 3 else tuple(str(number) for number in range(1, count + 1))
+
+
 @dataclass(frozen=True, slots=True)
 class MessageField:
     """One field of a message type.

@@ -22,7 +22,16 @@ Row = tuple[str, Value, Value]  # key, recorded, replayed
 _COUNTS = frozenset(
     {"ticks", "contacts", "observations", "frames_dropped", "dropped_frames", "frames_missing_from_camera", "seed"}
 )
-_UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns", "_error": "", "_rad": "rad"}
+_UNITS = {
+    "_mt": "mT",
+    "_um_s": "um/s",
+    "_um": "um",
+    "_s": "s",
+    "_bytes": "bytes",
+    "_ns": "ns",
+    "_error": "",
+    "_rad": "rad",
+}
 _WHOLE = ("_bytes", "_ns")
 _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
@@ -40,6 +49,7 @@ _NAMES = {
     "observations": "flow observations",
     "assumed_method": "assumed flow",
     "refined_method": "refined flow",
+    "unmet_mt": "missing field",
 }
 
 
@@ -155,6 +165,14 @@ def flow_text(figures: Mapping[str, Value]) -> str:
     return told
 
 
+def _unmet_text(figures: Mapping[str, Value]) -> str:
+    """Sentence on the amplitude that the coils could not make; '' if they made all of it."""
+    missing = figures.get("unmet_mt")
+    if not missing:
+        return ""
+    return f"the field was {text_of_figure('unmet_mt', missing)} weaker than asked for: a limit of the coils"
+
+
 def _in_brackets(text: str | None) -> str:
     return f"({text})" if text else ""
 
@@ -188,7 +206,7 @@ def verdict_lines(figures: Mapping[str, Value], refined: FlowField | None = None
     ended += ", doubtful" if ended and doubts else ""
     flow = flow_text(figures)
     asked = flow or not ended or refined is None or not refined.refused  # else no flow was: an open field
-    told = [ended, note, *doubts, way_text(figures), flow, learned_text(refined) if asked else ""]
+    told = [ended, note, *doubts, way_text(figures), _unmet_text(figures), flow, learned_text(refined) if asked else ""]
     return [with_micro(text[:1].upper() + text[1:]) for text in told if text]
 
 

@@ -26,6 +26,7 @@ from flowrec.core.messages import (
     FlowField,
     Frame,
     Health,
+    Measured,
     Mission,
     Observations,
     OperatorEvent,
@@ -123,6 +124,7 @@ class Tick:
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
     background: Annotated[Background | None, Topic("/camera/background", Source.STAGE, 1e-6)] = None
     shift: Annotated[Shift | None, Topic("/camera/shift", Source.STAGE, 1e-6)] = None
+    measured: Annotated[Measured | None, Topic("/coils/measured", Source.RIG)] = None
     extra: Extra = NO_EXTRA  # of the other topics that the run declares (declared_topics.py)
 
     @property

@@ -10,6 +10,7 @@ from .calibrate_motion import (
     ANYWHERE as ANYWHERE, calibrate_motion as calibrate_motion, figures_of as figures_of, fit_log as fit_log, fit_samples as fit_samples,
     heading_settings as heading_settings, remarks as remarks, rows_of as rows_of, sampled_s as sampled_s,
 )
+from .coil_windings import windings_matrix as windings_matrix
 from .motion_fit import MotionFit as MotionFit, UNEXPLAINED as UNEXPLAINED
 from .picture_registration import ImageVerdict as ImageVerdict, orientation_by_image as orientation_by_image
 from .tuning import tune as tune

@@ -55,7 +55,7 @@ class CoilProposal(NamedTuple):
             rows.append(
                 (
                     f"b_{name}",
-                    *(_with_doubt(fit.mt_per_a[axis, coil], fit.mt_per_a_std[axis, coil]) for coil in range(3)),
+                    *(_with_doubt(*each) for each in zip(fit.mt_per_a[axis], fit.mt_per_a_std[axis], strict=True)),
                     _with_doubt(fit.bias_mt[axis], fit.bias_std_mt[axis]),
                     f"{fit.noise_mt[axis]:.2g}",
                     f"{fit.residual_mt[worst, axis]:+.2g} (line {lines[worst]})",
@@ -63,7 +63,7 @@ class CoilProposal(NamedTuple):
             )
         table(
             f"{fit.excitations.name}: {len(lines)} excitations; mT per A of each coil, bias and residuals in mT",
-            ("", "coil x", "coil y", "coil z", "bias", "residual", "worst"),
+            ("", *(f"coil {name}" for name in fit.excitations.coils), "bias", "residual", "worst"),
             rows,
         )
         direction, strength = fit.weakest

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import csv
 import math
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit  # quantile of Student's t; scipy.stats takes 0.3 s to load
 
-from flowrec.core import Floats, UsageError, refuse_irregular
-from flowrec.stages import WORST_CONDITION, direction_name
+from flowrec.core import Floats, UsageError, coil_names, refuse_irregular
+from flowrec.stages import WORST_CONDITION, current_columns, direction_name
 
-_COLUMNS = ("i_x_a", "i_y_a", "i_z_a", "b_x_mt", "b_y_mt", "b_z_mt")
-_HEADER = ",".join(_COLUMNS)
+_FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
+_HEADER = ",".join((*current_columns(3), *_FIELDS))
+_NUMBERED = re.compile(r"i_(\d+)_a")
 _UNIT_NAMES = {"a": "ampere", "mt": "millitesla"}
-_UNKNOWNS = 4  # of each axis: three coils and the bias
-_LEAST_ROWS = _UNKNOWNS + 1
-_GOOD_ROWS = 12
-_GOOD_SET = f"{_GOOD_ROWS} are recommended: each coil alone with both signs, then some of all three at once"
 _SIGNIFICANCE = 0.05  # probability that a calibration without a wrong row is reported to have one
 _WEAK_EXCITATION = 0.05  # fraction of the strongest direction of the currents
 _NOMINAL_MT = 4.0  # of the field whose standard error is stated
@@ -29,16 +28,38 @@ _DIRECTIONS = 400  # in which the uncertainty is evaluated
 class Excitations(NamedTuple):
     """Rows of the file. Axes are those of the chip: x and y as in the image, z up from the floor."""
 
-    currents_a: Floats  # (n, 3)
+    currents_a: Floats  # (n, coils)
     field_mt: Floats  # (n, 3)
     lines: tuple[int, ...]  # (n,) line of each row in the file
     name: str
+
+    @property
+    def coils(self) -> tuple[str, ...]:
+        """Names of the coils, as in the columns."""
+        return coil_names(self.currents_a.shape[1])
+
+    @property
+    def unknowns(self) -> int:
+        """Unknowns of each axis: the coils and the bias."""
+        return len(self.coils) + 1
+
+    @property
+    def good_rows(self) -> int:
+        """Number of rows that is recommended."""
+        return 4 * len(self.coils)
+
+    @property
+    def good_set(self) -> str:
+        """The rows that are recommended, in words."""
+        every = "all three" if len(self.coils) == 3 else f"all {len(self.coils)}"
+        return f"{self.good_rows} are recommended: each coil alone with both signs, then some of {every} at once"
 
 
 def read_excitations(path: Path) -> Excitations:
     """Read a CSV file of currents that were set and fields that a probe at the robot's position showed.
 
-    Its columns are i_x_a, i_y_a, i_z_a, b_x_mt, b_y_mt, b_z_mt in any order; lines that begin with # are comments.
+    Its columns are i_x_a, i_y_a, i_z_a, or of more than three coils i_1_a, i_2_a, ..., and b_x_mt, b_y_mt, b_z_mt, in
+    any order; lines that begin with # are comments.
 
     Raises
     ------
@@ -59,16 +80,17 @@ def read_excitations(path: Path) -> Excitations:
     if not rows:
         raise UsageError(f"{path}: is empty; the first line is {_HEADER}, then one row for each excitation")
     (_, where_header, header), *rows = rows
-    places = [_place(name, header, where_header) for name in _COLUMNS]
+    names = (*current_columns(_coils_of(header)), *_FIELDS)
+    places = [_place(name, header, where_header, names) for name in names]
     values = []
     for _, where, cells in rows:
         if len(cells) != len(header):
             raise UsageError(
                 f"{where}: {len(cells)} values where the header has {len(header)} columns; correct that line"
             )
-        values.append([_number(name, cells[place], where) for name, place in zip(_COLUMNS, places, strict=True)])
-    table = np.array(values, np.float64).reshape(-1, 6)
-    return Excitations(table[:, :3], table[:, 3:], tuple(number for number, _, _ in rows), path.name)
+        values.append([_number(name, cells[place], where) for name, place in zip(names, places, strict=True)])
+    table = np.array(values, np.float64).reshape(-1, len(names))
+    return Excitations(table[:, :-3], table[:, -3:], tuple(number for number, _, _ in rows), path.name)
 
 
 def _cells(line: str, where: str) -> list[str]:
@@ -78,7 +100,13 @@ def _cells(line: str, where: str) -> list[str]:
         raise UsageError(f"{where}: {error}; is it no table?") from error
 
 
-def _place(name: str, header: list[str], where: str) -> int:
+def _coils_of(header: list[str]) -> int:
+    """Number of coils that a header has columns for: three, unless it numbers them."""
+    numbers = [int(found[1]) for cell in header if (found := _NUMBERED.fullmatch(cell.lower()))]
+    return min(max(numbers), len(header)) if numbers else 3
+
+
+def _place(name: str, header: list[str], where: str, names: Sequence[str]) -> int:
     """Place of a column in the header."""
     given = [each.lower() for each in header]
     if given.count(name) == 1:
@@ -90,7 +118,7 @@ def _place(name: str, header: list[str], where: str) -> int:
     stem, _, unit = name.rpartition("_")
     other = next((word for word in given if stem in (word.rpartition("_")[0], word)), None)
     if other is None:
-        raise UsageError(f"{where}: no column {name}; the header is {_HEADER}")
+        raise UsageError(f"{where}: no column {name}; the header is {','.join(names)}")
     raise UsageError(
         f"{where}: column {other!r} where {name!r} belongs: give it in {_UNIT_NAMES[unit]}, and say so in its name"
     )
@@ -107,11 +135,11 @@ def _number(name: str, cell: str, where: str) -> float:
 
 
 class CoilFit(NamedTuple):
-    """B = A i + b with uncertainties; arrays by axis of the field (rows) and coil (columns), both x, y, z."""
+    """B = A i + b with uncertainties; arrays by axis of the field (rows) and coil (columns)."""
 
     excitations: Excitations
-    mt_per_a: Floats  # (3, 3) A
-    mt_per_a_std: Floats  # (3, 3) standard errors
+    mt_per_a: Floats  # (3, coils) A
+    mt_per_a_std: Floats  # (3, coils) standard errors
     bias_mt: Floats  # (3,)
     bias_std_mt: Floats  # (3,)
     residual_mt: Floats  # (n, 3) measured minus fitted
@@ -164,12 +192,12 @@ def fit_coils(excitations: Excitations) -> CoilFit:
     count = len(currents)
     X = np.column_stack([currents, np.ones(count)])
     Q, R = np.linalg.qr(X)
-    solution = np.linalg.solve(R, Q.T @ field)  # (4, 3)
+    solution = np.linalg.solve(R, Q.T @ field)  # (coils + 1, 3)
     residual = field - X @ solution
-    freedom = count - _UNKNOWNS
+    freedom = count - excitations.unknowns
     variance = (residual**2).sum(0) / freedom
     unscaled = np.linalg.inv(R.T @ R)
-    std = np.sqrt(np.outer(variance, np.diag(unscaled)))  # (3, 4)
+    std = np.sqrt(np.outer(variance, np.diag(unscaled)))  # (3, coils + 1)
     leverage = (Q**2).sum(1)
     free = np.where(leverage < 1.0 - 1e-9, 1.0 - leverage, np.nan)[:, None]
     left_out = residual / free
@@ -181,7 +209,7 @@ def fit_coils(excitations: Excitations) -> CoilFit:
         floor = (1e-12 * max(float(np.abs(field).max()), 1e-12)) ** 2
         score = residual / np.sqrt((others[:, None] + floor) * free)
         critical_score = float(stdtrit(3 * (freedom - 1), 1.0 - 0.5 * _SIGNIFICANCE / residual.size))
-    A = solution[:3].T
+    A = solution[:-1].T
     directions, gain, _ = np.linalg.svd(A)
     if gain[-1] * WORST_CONDITION <= gain[0]:
         raise UsageError(
@@ -191,22 +219,22 @@ def fit_coils(excitations: Excitations) -> CoilFit:
     return CoilFit(
         excitations=excitations,
         mt_per_a=A,
-        mt_per_a_std=std[:, :3],
-        bias_mt=solution[3],
-        bias_std_mt=std[:, 3],
+        mt_per_a_std=std[:, :-1],
+        bias_mt=solution[-1],
+        bias_std_mt=std[:, -1],
         residual_mt=residual,
         noise_mt=np.sqrt(variance),
         freedom=freedom,
         left_out_mt=left_out,
         score=score,
         critical_score=critical_score,
-        uncertainty_mt=_uncertainty_mt(A, solution[3], variance, unscaled),
+        uncertainty_mt=_uncertainty_mt(A, solution[-1], variance, unscaled),
     )
 
 
 def advice(fit: CoilFit) -> list[str]:
     """Instructions to improve the calibration, in sentences; empty if nothing would improve it much."""
-    sentences, lines = [], fit.excitations.lines
+    sentences, lines, names = [], fit.excitations.lines, fit.excitations.coils
     for row in fit.suspects:
         axis = int(np.nanargmax(np.abs(fit.score[row])))
         sentences.append(
@@ -218,10 +246,11 @@ def advice(fit: CoilFit) -> list[str]:
             f"line {', '.join(str(lines[row]) for row in fit.unchecked)}: no other row excites what this one does, so "
             "an error in it would not be seen; add its opposite"
         )
-    if len(lines) < _GOOD_ROWS:
-        sentences.append(f"{len(lines)} rows leave {fit.freedom} degrees of freedom for the residuals; {_GOOD_SET}")
+    if len(lines) < fit.excitations.good_rows:
+        good = fit.excitations.good_set
+        sentences.append(f"{len(lines)} rows leave {fit.freedom} degrees of freedom for the residuals; {good}")
     low, high = fit.excitations.currents_a.min(axis=0), fit.excitations.currents_a.max(axis=0)
-    one_sided = ["xyz"[c] for c in range(3) if low[c] > -0.2 * high[c] or high[c] <= 0.0]
+    one_sided = [name for c, name in enumerate(names) if low[c] > -0.2 * high[c] or high[c] <= 0.0]
     if one_sided:
         sentences.append(
             f"coil {', '.join(one_sided)} was driven one way only: add rows with the opposite sign, to tell the bias "
@@ -231,12 +260,13 @@ def advice(fit: CoilFit) -> list[str]:
 
 
 def _refuse_too_little(excitations: Excitations) -> None:
-    """Raise UsageError if the rows do not determine the twelve unknowns, and say what to add."""
-    currents, where = excitations.currents_a, excitations.name
-    if len(currents) < _LEAST_ROWS:
+    """Raise UsageError if the rows do not determine the unknowns, and say what to add."""
+    currents, where, unknowns = excitations.currents_a, excitations.name, excitations.unknowns
+    if len(currents) <= unknowns:
+        count = "three" if unknowns == 4 else str(unknowns - 1)
         raise UsageError(
-            f"{where}: {len(currents)} rows; three coils and a bias take {_UNKNOWNS}, and {_LEAST_ROWS} to see any "
-            f"residual; {_GOOD_SET}"
+            f"{where}: {len(currents)} rows; {count} coils and a bias take {unknowns}, and {unknowns + 1} to see any "
+            f"residual; {excitations.good_set}"
         )
     spread = currents - currents.mean(0)
     _, size, directions = np.linalg.svd(spread, full_matrices=False)
@@ -245,15 +275,15 @@ def _refuse_too_little(excitations: Excitations) -> None:
     if size[-1] >= _WEAK_EXCITATION * size[0]:
         return
     missing = [direction for s, direction in zip(size, directions, strict=True) if s < _WEAK_EXCITATION * size[0]]
-    coils = [c for c in range(3) if any(abs(direction[c]) > 0.3 for direction in missing)]
-    names = " and ".join("xyz"[c] for c in coils)
+    coils = [c for c in range(unknowns - 1) if any(abs(direction[c]) > 0.3 for direction in missing)]
+    names = " and ".join(excitations.coils[c] for c in coils)
     level = float(np.abs(currents).max()) or 1.0
     if len(missing) == 1 and len(coils) > 1:
         why = f"the currents of coils {names} always change together, so their fields can not be told apart"
     else:
         why = f"coil{'s' if len(coils) > 1 else ''} {names} {'were' if len(coils) > 1 else 'was'} hardly driven"
     rows = [
-        ",".join(f"{sign * level:g}" if k == c else "0" for k in range(3))
+        ",".join(f"{sign * level:g}" if k == c else "0" for k in range(unknowns - 1))
         for c in (coils if len(missing) == len(coils) else coils[:1])
         for sign in (1.0, -1.0)
     ]
@@ -266,6 +296,6 @@ def _uncertainty_mt(A: Floats, bias: Floats, variance: Floats, unscaled: Floats)
     z, azimuth = 1.0 - k / (0.5 * _DIRECTIONS), np.pi * (1.0 + 5.0**0.5) * k
     ring = np.sqrt(1.0 - z**2)
     field = _NOMINAL_MT * np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
-    x = np.column_stack([np.linalg.solve(A, (field - bias).T).T, np.ones(len(k))])
+    x = np.column_stack([np.linalg.lstsq(A, (field - bias).T)[0].T, np.ones(len(k))])
     spread = np.einsum("ni,ij,nj->n", x, unscaled, x)
     return float(np.sqrt(spread.max() * variance.sum()))

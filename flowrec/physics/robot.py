@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import Floats, FlowField, PositiveShare, Range
+from flowrec.core import Applied, Floats, FlowField, PositiveShare, Range, UsageError, seconds
 
 _SIGNIFICANT = 2.0  # standard deviations
 _NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are meant for
@@ -33,13 +35,32 @@ class RobotSettings:
     step_out_hz: _Frequency | None = None
     step_out_margin: PositiveShare = 0.9  # fraction of the step-out frequency that is commanded at most
     delay_s: _Delay | None = None  # time from command to motion. None: fits channels and speed
+    # Speed that is not in proportion to the frequency: pairs of frequency (Hz) and speed through the fluid (um/s), both
+    # rising, as measured. um_per_rev is then that of the first pair. (): um_per_rev holds at every frequency
+    speed_at_hz: Annotated[tuple[tuple[float, float], ...], Range(1e-3, 1e6)] = ()
+
+    def check(self, where: str) -> None:
+        """Refuse a table that does not tell one frequency for each speed.
+
+        Raises
+        ------
+        UsageError : one line, the key first; `where` is the origin of the settings.
+        """
+        if any(b[0] <= a[0] or b[1] <= a[1] for a, b in pairwise(self.speed_at_hz)):
+            raise UsageError(
+                f"{where}: robot.speed_at_hz: frequencies and speeds must both rise from pair to pair; sort them, and "
+                "leave out what lies beyond the fastest speed, where the robot steps out"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Robot(RobotSettings):
     """The robot of a resolved configuration: kinematics xdot = u (cos phi, sin phi) + v(x), u = k f.
 
-    This is eq. kinematic of the paper; k is `um_per_rev`, f the frequency of the field, phi its heading.
+    This is eq. kinematic of the paper; k is `um_per_rev`, f the frequency of the field, phi its heading. A robot with a
+    table has u = k g(f), where g is linear between the pairs of the table and g(f) = f up to the first one. Estimation,
+    planning and control know its `proportional` alone, which is as fast in a field of the frequency g(f); coils and rig
+    know the frequency itself.
     """
 
     radius_um: _Radius
@@ -50,7 +71,51 @@ class Robot(RobotSettings):
     @property
     def speed_limit_um_s(self) -> float:
         """The fastest speed through the fluid that may be commanded, um/s."""
-        return min(self.max_speed_um_s, self.step_out_margin * self.step_out_hz * self.um_per_rev)
+        return min(self.max_speed_um_s, self.proportional_hz(self.step_out_margin * self.step_out_hz) * self.um_per_rev)
+
+    def proportional_hz(self, frequency_hz: float) -> float:
+        """The g(f) of a frequency f; above the last pair that of the last pair."""
+        if not self.speed_at_hz:
+            return frequency_hz
+        hz, proportional_hz = self._pairs()
+        return float(np.interp(frequency_hz, hz, proportional_hz))
+
+    def frequency_hz(self, proportional_hz: float) -> float:
+        """The frequency f of a g(f); at most that of the last pair."""
+        if not self.speed_at_hz:
+            return proportional_hz
+        hz, found_hz = self._pairs()
+        return float(np.interp(proportional_hz, found_hz, hz))
+
+    def proportional(self) -> Robot:
+        """The robot without a table that is as fast at g(f) as this one at f, up to the same speed."""
+        return self._with_response((), self.proportional_hz)
+
+    def responding(self, proportional: Robot) -> Robot:
+        """A robot like `proportional` with the table of this one: the reverse of `proportional`."""
+        return proportional._with_response(self.speed_at_hz, self.frequency_hz)
+
+    def proportional_turns(self, before: Applied | None, applied: Applied) -> Applied:
+        """The message with the turns of the field that would have moved the `proportional` robot as far.
+
+        The frequency is the mean since the message before.
+        """
+        if not self.speed_at_hz or before is None or applied.stamp_ns <= before.stamp_ns:
+            return applied
+        mean_hz = math.hypot(*applied.turns) / seconds(applied.stamp_ns - before.stamp_ns)
+        return replace(applied, turns=self.proportional_hz(mean_hz) / mean_hz * applied.turns) if mean_hz else applied
+
+    def _with_response(self, table: tuple[tuple[float, float], ...], changed: Callable[[float], float]) -> Robot:
+        if self.speed_at_hz == table:
+            return self
+        fastest_hz = changed(self.step_out_margin * self.step_out_hz)
+        return replace(self, speed_at_hz=table, step_out_hz=fastest_hz / self.step_out_margin)
+
+    def _pairs(self) -> tuple[list[float], list[float]]:
+        """Frequencies f of the table, and their g(f), both from 0."""
+        first_hz, first_um_s = self.speed_at_hz[0]
+        scale = first_hz / first_um_s
+        return [0.0, *(hz for hz, _ in self.speed_at_hz)], [0.0, *(scale * um_s for _, um_s in self.speed_at_hz)]
 
     @property
     def speed_ratio(self) -> float:
@@ -90,10 +155,14 @@ class Robot(RobotSettings):
 
     def speed_limit_at(self, strength: float) -> float:
         """Speed limit in a field of this fraction of the full amplitude, um/s: step-out falls with the torque."""
-        return min(self.speed_limit_um_s, strength * self.step_out_margin * self.step_out_hz * self.um_per_rev)
+        fastest_hz = self.proportional_hz(strength * self.step_out_margin * self.step_out_hz)
+        return min(self.speed_limit_um_s, fastest_hz * self.um_per_rev)
 
     def rolled_speed_um_s(self, frequency_hz: float) -> float:
         """Speed at a field frequency: proportional up to step-out, then the mean of Adler's equation, um/s."""
         if frequency_hz <= self.step_out_hz:
-            return self.um_per_rev * frequency_hz
-        return self.um_per_rev * (frequency_hz - math.sqrt(frequency_hz**2 - self.step_out_hz**2))
+            return self.um_per_rev * self.proportional_hz(frequency_hz)
+        slipping_hz = frequency_hz - math.sqrt(frequency_hz**2 - self.step_out_hz**2)
+        if not self.speed_at_hz:
+            return self.um_per_rev * slipping_hz
+        return self.um_per_rev * self.proportional_hz(self.step_out_hz) / self.step_out_hz * slipping_hz

@@ -6,7 +6,7 @@ from .config import (
 from .control.amplifier import (
     AmplifierSettings as AmplifierSettings, WORST_CONDITION as WORST_CONDITION, direction_name as direction_name,
 )
-from .control.coil_log import columns_by_unit as columns_by_unit, is_of_session as is_of_session, read_coil_log as read_coil_log
+from .control.coil_log import columns_by_unit as columns_by_unit, current_columns as current_columns, is_of_session as is_of_session, read_coil_log as read_coil_log
 from .control.coils import Coils as Coils, field_limits as field_limits
 from .control.controller import CONTROLLERS as CONTROLLERS, Controller as Controller
 from .control.field_log import FieldLog as FieldLog

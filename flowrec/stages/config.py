@@ -340,6 +340,7 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
         if fault not in known:
             raise UsageError(f"{origin(fault.key)}: {fault}")
     config.coils.check(origin("coils"))
+    config.robot.check(origin("robot"))
     recording = config.recording
     if recording.snapshot_before_s and (recording.split_mb or recording.split_s):
         raise UsageError(

@@ -30,6 +30,7 @@ from flowrec.core import (
     Floats,
     FlowField,
     Frame,
+    Measured,
     Message,
     Observations,
     OperatorEvent,
@@ -82,6 +83,7 @@ class Inputs:
     shift: Shift | None = None  # likewise
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
     losses: CameraLosses | None = None  # of the camera so far, for the record only
+    measured: Measured | None = None  # currents of the coils, by an amplifier that measures them; for the record only
     extra: Mapping[str, Message] = NO_EXTRA  # new messages of the extra topics of rig and simulator, by path
 
 
@@ -100,7 +102,8 @@ class Pipeline:
 
     chip: Chip
     calibration: Calibration
-    robot: Robot
+    robot: Robot  # in proportion to the frequency, see physics.Robot
+    response: Robot  # as the coils drive it
     clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
     image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
     image_bits: int  # depth of their pixels
@@ -128,7 +131,8 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     return Pipeline(
         chip=chip,
         calibration=calibration_of(config, chip),
-        robot=config.robot,
+        robot=config.robot.proportional(),
+        response=config.robot,
         clearance_um=clearance_um(chip.mask, chip.um_per_px),
         image_shape=(config.camera.height_px, config.camera.width_px),
         image_bits=config.camera.bits,
@@ -226,7 +230,7 @@ def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
     return sight._replace(track=replace(track, seen_ns=track.stamp_ns if track.seen else before_ns))
 
 
-def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track) -> tuple[AxesCheck | None, Floats | None]:
+def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track, rolled: Applied) -> tuple[AxesCheck | None, Floats | None]:
     """The check of the axes, and the velocity (2,) that it drives the robot with; None: the robot is controlled."""
     mission = last.mission
     checks = p.mission.check_axes and not p.mission.observes
@@ -246,7 +250,7 @@ def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track) -> tuple[AxesCheck 
     if not waits and since_s >= free_s:
         wall_um = _wall_um(p, start_um)
         frame_s = p.planner.swift.frame_s or 0.0
-        axes = watch(axes, track, tick.applied, p.robot, map_um_s, wall_um, frame_s, p.calibration, p.coils)
+        axes = watch(axes, track, rolled, p.robot, map_um_s, wall_um, frame_s, p.calibration, p.coils)
     if axes is not None and axes.verdict:
         return axes, None
     return axes, steady_velocity(axes, map_um_s) + (np.zeros(2) if waits else leg_velocity(axes))
@@ -312,7 +316,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     else:
         known, seen = p.robot, None if flow is None else _without_registration(flow)
     turn = known.course_turn(tick.refined) if p.refiner.correct_heading else None
-    applied = inputs.applied if turn is None else replace(inputs.applied, turns=turn @ inputs.applied.turns)
+    rolled = p.response.proportional_turns(last.applied, inputs.applied)
+    applied = rolled if turn is None else replace(rolled, turns=turn @ rolled.turns)
     estimate = p.observer.estimate(last.estimate, track, applied, known, seen, last.health)
     # The robot with the estimated um_per_rev, if the observer estimates it.
     robot = known if estimate.um_per_rev is None else replace(known, um_per_rev=estimate.um_per_rev)
@@ -330,13 +335,13 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         # Observations are those of the robot as stated: what a refinement finds of it, the next one finds again.
         corrected = known is not p.robot or turn is not None
         mapless = p.observer.without_map(
-            last.mapless, last.estimate, estimate, track, inputs.applied, p.robot, corrected=corrected
+            last.mapless, last.estimate, estimate, track, rolled, p.robot, corrected=corrected
         )
         measured = p.observer.measured_estimate(mapless, estimate)
     before = None if last.estimate is None else p.observer.measured_estimate(last.mapless, last.estimate)
     observations = p.sampler.collect(last.observations, before, measured, p.robot)
     lap("observe")
-    axes, driven_um_s = _axes(p, last, tick, track)
+    axes, driven_um_s = _axes(p, last, tick, track, rolled)
     mission = p.mission.update(
         last.mission,
         track,
@@ -374,7 +379,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     cut = cut or mission.field_off
     # Of a robot that leaves its heading, the heading is turned back by as much.
     ordered = demand if turn is None else replace(demand, velocity_um_s=turn.T @ demand.velocity_um_s)
-    currents = p.coils.drive(last.currents, ordered, robot, mission.finished, cut)
+    currents = p.coils.drive(last.currents, ordered, p.response.responding(robot), mission.finished, cut)
     lap("control")
     tick = replace(
         tick,

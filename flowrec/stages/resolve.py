@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from typing import Any, TypeVar
@@ -168,6 +169,11 @@ def _fit_to_chip(config: Config, chip: Chip) -> tuple[Robot, ResolvedCamera]:
     width_um, height_um = chip.size_um
     um_per_px, radius_um, speed_um_s = camera.um_per_px, asked.radius_um, asked.max_speed_um_s
     delay_s, step_out_hz, rate_hz = asked.delay_s, asked.step_out_hz, camera.rate_hz
+    if asked.speed_at_hz:
+        (first_hz, first_um_s), (last_hz, last_um_s) = asked.speed_at_hz[0], asked.speed_at_hz[-1]
+        asked = replace(asked, um_per_rev=first_um_s / first_hz)
+        speed_um_s = min(speed_um_s or math.inf, last_um_s)
+        step_out_hz = step_out_hz or last_hz
     if um_per_px is None:
         right_um, down_um = np.abs(Calibration(1.0, (0.0, 0.0), camera.angle_deg).axes) @ (width_um, height_um)
         um_per_px = float(max(right_um / camera.width_px, down_um / camera.height_px))

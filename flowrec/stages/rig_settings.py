@@ -148,6 +148,10 @@ class OutputLimits:
     longest_on_s: Annotated[float, Range(0.1, 1e6)] = 3600.0
     # time for which they rest then; a shorter rest gives back a part of it
     rest_s: Annotated[float, Range(1e-3, 1e6)] = 600.0
+    # largest difference between the current of a coil as put out and as the amplifier measures it; None: not compared
+    measured_within_a: Annotated[float, Range(1e-4, 1e3)] | None = None
+    # time for which a difference may be larger; then the coils go to zero and the run ends
+    measured_after_s: Annotated[float, Range(0.0, 10.0)] = 0.05
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,6 +80,8 @@ def figures_of(
         figures["latest_goal"] = f"{mission.goal_um[0]:.0f}, {mission.goal_um[1]:.0f} um"
     if mission is not None and mission.speed_limit_um_s is not None:
         figures["speed_limit_um_s"] = mission.speed_limit_um_s
+    if last.currents is not None and last.currents.unmet_mt > 0.0:
+        figures["unmet_mt"] = last.currents.unmet_mt
     if true_field is not None:
         figures["contacts"] = contacts
     if not tells_flow(chip, last):

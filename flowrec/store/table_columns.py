@@ -27,6 +27,7 @@ from flowrec.core import (
     Observations,
     TopicTable,
     UsageError,
+    coil_names,
     message_fields,
     read_table,
     unit_of,
@@ -106,7 +107,7 @@ def _columns(field: MessageField, coils: int) -> list[Column]:
     shape = (coils,) if of_coils else shape
     if len(shape) == 1 and (shape[0] in (2, 3) or of_coils) and not field.optional:
         count = int(shape[0])
-        parts: Iterable[str | int] = _AXES[:count] if count in (2, 3) else range(1, count + 1)
+        parts: Iterable[str] = coil_names(count) if of_coils else _AXES[:count]
         suffix = unit_suffix(field.name)
         stem = field.name.removesuffix(suffix)
         return [

@@ -26,13 +26,33 @@ class _Calibrations(WholeDescriptions):
 
 @verb()
 def coils(
-    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt; of more coils i_1_a,i_2_a,..."
+        ),
+    ] = None,
     out: TomlOut = None,
+    winding: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--winding",
+            metavar="AXIS:KIND:RADIUS_MM:TURNS",
+            help="Instead of a file, a coil or pair by formula: x:helmholtz:50:120, y:maxwell:50:80, "
+            "z:pair:40:100:45 or -z:coil:40:100:30 with a distance in mm; one for each output.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> object:
     """Fit the field per ampere of the coils and the bias to measured fields, with standard errors (section coils)."""
-    from flowrec.measure import calibrate_coils
+    from flowrec.core import UsageError
+    from flowrec.measure import calibrate_coils, windings_matrix
 
+    if (file is None) == (not winding):
+        raise UsageError("calibrate coils: give a table of measured fields, or --winding for each coil, not both")
+    if winding:
+        return windings_matrix(winding, out, overwrite)
+    assert file is not None
     return calibrate_coils(file, out, overwrite)
 
 

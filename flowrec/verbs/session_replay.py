@@ -305,10 +305,12 @@ def hindsight(session: Session, pipeline: Pipeline) -> Callable[[int], Observati
         )
     tracks: list[Track] = []
     applied: list[Applied] = []
+    before: Applied | None = None
     for tick in session.ticks(with_frames=False):
         if tick.track is not None and tick.applied is not None and (not tracks or tick.track is not tracks[-1]):
             tracks.append(tick.track)
-            applied.append(tick.applied)
+            applied.append(pipeline.response.proportional_turns(before, tick.applied))
+            before = tick.applied
     robot, sampler = pipeline.robot, pipeline.sampler
 
     def observations(stamp_ns: int) -> Observations:

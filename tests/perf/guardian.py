@@ -67,7 +67,7 @@ def trial(on: Device, fault: str, silence_s: float = TIMER_S) -> Ended | None:
     own = fault if fault in ("hang", "spin") else ""
     begin = on.end()
     said, says = _CONTEXT.Pipe(duplex=False)
-    recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, own))
+    recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, own, on.coils))
     recorder.start()
     says.close()
     assert recorder.pid is not None
@@ -110,7 +110,7 @@ def blocks(on: Device, seconds: float, silence_s: float = TIMER_S) -> Blocks:
     """Put out a field for so long, with another frequency and heading in each frame; what the outputs did meanwhile."""
     begin = on.end()
     said, says = _CONTEXT.Pipe(duplex=False)
-    recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, ""))
+    recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, "", on.coils))
     recorder.start()
     says.close()
     try:
@@ -127,8 +127,8 @@ def blocks(on: Device, seconds: float, silence_s: float = TIMER_S) -> Blocks:
     times, outputs = on.outputs(begin)
     off_ns = on.off_ns(begin_ns, begin)
     kept = outputs[(times >= begin_ns) & (times < min(end_ns, off_ns or end_ns) - 10_000_000)]
-    limits = CommandLimits(guardian_trial.COILS, guardian_trial.ROBOT, guardian_trial.OUTPUT)
-    bound = limits.slew_a_s / guardian_trial.COILS.amplifier.output_hz / min(guardian_trial.COILS.amplifier.a_per_v)
+    limits = CommandLimits(guardian_trial.coils_of(on.coils), guardian_trial.ROBOT, guardian_trial.OUTPUT)
+    bound = limits.slew_a_s / limits.coils.amplifier.output_hz * limits.coils.amplifier.ohm.max()
     step = float(np.abs(np.diff(kept, axis=0)).max())
     return Blocks(1e-9 * (end_ns - begin_ns), step, bound, ran_dry, off_ns is not None)
 
@@ -211,6 +211,7 @@ def measure(
     load: Annotated[int, typer.Option(help="processes that compute meanwhile")] = 0,
     kinds: Annotated[str, typer.Option(help="devices, separated by commas")] = "serial,serial+timer,ni",
     blocks_s: Annotated[float, typer.Option(help="time of NI blocks with every core busy; 0: none")] = 60.0,
+    coils: Annotated[int, typer.Option(help="coils of each device: 3 or 6; with --record 3")] = 3,
     record: Annotated[bool, typer.Option(help="the recorder is a mission of `flowrec record --rig lab`")] = False,
 ) -> Results:
     """Times from the fault to zero, by device and fault; the output of NI blocks on a busy machine."""
@@ -224,7 +225,7 @@ def measure(
             else:
                 faults = {"kill": kills, "stop": stops, "hang": others, "spin": others, "signals": others}
                 faults |= {"guardian": others} | ({"kill both": others} if kind == "ni" else {})
-            with device(kind, folder) as on:
+            with device(kind, folder, coils=coils) as on:
                 if kind == "ni" and blocks_s and not record:
                     with busy(os.cpu_count() or 1):
                         long = asdict(blocks(on, blocks_s))

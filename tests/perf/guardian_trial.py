@@ -22,24 +22,35 @@ from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.rig_settings import OutputLimits
-from tests.twins.coils import CHANNELS
+from tests.twins.coils import channels
 
 COILS = Coils(bias_mt=(0.05, 0.0, -0.04))
+# Three pairs that are not quite alike. At 2.1 A currents of least norm make 3.73 mT in any direction; 4 are possible.
+SIX_COILS = Coils(
+    mt_per_a=((1.3, 0.8, 0.1, -0.1, 0.05, 0.0), (0.1, -0.05, 0.9, 1.1, 0.0, 0.1), (0.0, 0.1, -0.05, 0.05, 1.0, 1.1)),
+    bias_mt=(0.05, 0.0, -0.04),
+    max_current_a=2.1,
+)
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=500.0, step_out_hz=30.0)
 OUTPUT = OutputLimits()
 _FRAME_S = 1.0 / 60.0
 
 
-def amplifier(kind: str, address: str, silence_s: float = 0.1) -> Amplifier:
+def coils_of(count: int) -> Coils:
+    """The settings of so many coils."""
+    return COILS if count == COILS.count else SIX_COILS
+
+
+def amplifier(kind: str, address: str, silence_s: float = 0.1, coils: Coils = COILS) -> Amplifier:
     """The amplifier of a twin."""
     if kind == "serial":
         from flowrec.rigs.lab.amplifiers.serial_line import SerialAmplifier
 
-        return SerialAmplifier(address, 115_200, COILS)
+        return SerialAmplifier(address, 115_200, coils)
     from flowrec.rigs.lab.amplifiers.ni import NiAmplifier
     from flowrec.rigs.lab.amplifiers.ni_process import NiSettings
 
-    return NiAmplifier(NiSettings(CHANNELS, address, COILS, ROBOT, OUTPUT, silence_s))
+    return NiAmplifier(NiSettings(channels(coils.count), address, coils, ROBOT, OUTPUT, silence_s))
 
 
 def currents(frequency_hz: float, heading_rad: float, amplitude_mt: float = 4.0) -> Currents:
@@ -56,9 +67,11 @@ def currents(frequency_hz: float, heading_rad: float, amplitude_mt: float = 4.0)
     )
 
 
-def record(say: Callable[[str], None], kind: str, address: str, silence_s: float, fault: str) -> None:
+def record(say: Callable[[str], None], kind: str, address: str, silence_s: float, fault: str, count: int) -> None:
     """Drive the coils until it is killed."""
-    with Drive(amplifier(kind, address, silence_s), CommandLimits(COILS, ROBOT, OUTPUT, say), silence_s, 1.0) as drive:
+    coils = coils_of(count)
+    limits = CommandLimits(coils, ROBOT, OUTPUT, say)
+    with Drive(amplifier(kind, address, silence_s, coils), limits, silence_s, 1.0) as drive:
         say(f"guardian {drive._guardian._process.pid}")
         if kind == "ni":
             say(f"process {drive._amplifier._process.pid}")
@@ -73,7 +86,7 @@ def record(say: Callable[[str], None], kind: str, address: str, silence_s: float
             now_ns = time.monotonic_ns()
             applied = drive.applied_at(now_ns, before_ns)
             before_ns = now_ns
-            if not said and applied.amplitude_mt >= 3.999:
+            if not said and applied.amplitude_mt >= 0.999 * limits.amplitude_mt:
                 say("on")
                 said = True
                 faulty_s = time.monotonic() + 0.2
@@ -85,10 +98,10 @@ def record(say: Callable[[str], None], kind: str, address: str, silence_s: float
                     pass
 
 
-def main(connection: Connection, kind: str, address: str, silence_s: float, fault: str) -> None:
+def main(connection: Connection, kind: str, address: str, silence_s: float, fault: str, count: int = 3) -> None:
     """The process; it says on the connection what the module's docstring states."""
     try:
         with realtime_priority():  # as flowrec record has it
-            record(connection.send, kind, address, silence_s, fault)
+            record(connection.send, kind, address, silence_s, fault, count)
     except RigError as error:
         connection.send(f"failed {error}")

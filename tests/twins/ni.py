@@ -1,10 +1,11 @@
-"""Twin of an NI gRPC Device Server with a cDAQ and one NI-9263 in it: `python -m tests.twins.ni FILE` prints its port.
+"""Twin of an NI gRPC Device Server with a module of a cDAQ: `python -m tests.twins.ni FILE [COILS]` prints its port.
 
 The client is NI's own package. What is modelled: buffers that are put out at the sample clock and, with regeneration
 off, run dry (-200290); values outside the range (-200077); outputs that another task has reserved (-50103); names that
 do not exist (-200220, -200170); a reset, which aborts every task (-88709) and takes the outputs to zero; and outputs
-that hold their last value when a task stops, runs dry, or its client dies. FILE gets every sample (firmware.SAMPLE),
-with the time at which it is put out. A second argument makes the product type of the reset that leaves the outputs as
+that hold their last value when a task stops, runs dry, or its client dies. FILE gets every sample (firmware.sample)
+of as many coils as are said,
+with the time at which it is put out. A third argument makes the product type of the reset that leaves the outputs as
 they are, as S Series does.
 """
 
@@ -26,9 +27,9 @@ from nidaqmx._stubs import nidaqmx_pb2 as pb
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
 from flowrec.core.system.processes import Priority, prioritise_process
-from tests.twins.firmware import SAMPLE
+from tests.twins.firmware import sample
 
-DEVICE, OUTPUTS, RANGE_V, MAX_RATE_HZ = "cDAQ1Mod1", 4, 10.0, 100_000.0
+DEVICE, RANGE_V, MAX_RATE_HZ = "cDAQ1Mod1", 10.0, 100_000.0
 _STEP_S = 0.001
 _REGENERATE = 10097
 _TYPES = {0x631: "NI 9263", 0x632: 0x1D2C3B4A}  # attributes of a device: product type, serial number
@@ -61,9 +62,10 @@ class Task:
 class NiTwin(rpc.NiDAQmxServicer):
     """The server. Every call takes the lock and first puts out what is due."""
 
-    def __init__(self, file: Path, reset_zeroes: bool = True) -> None:
+    def __init__(self, file: Path, reset_zeroes: bool = True, coils: int = 3) -> None:
         self.tasks: dict[str, Task] = {}
-        self.outputs = np.zeros(OUTPUTS)
+        self.outputs = np.zeros(coils + 1)  # one that drives no coil
+        self._coils = coils
         self.lock = threading.Lock()
         self.underflows = 0
         self._file = file.open("wb", buffering=0)
@@ -108,8 +110,8 @@ class NiTwin(rpc.NiDAQmxServicer):
                 task.error = -200290  # the outputs hold their last value
 
     def _log(self, at_ns: np.ndarray, values: np.ndarray) -> None:
-        records = np.zeros(len(at_ns), SAMPLE)
-        records["at_ns"], records["coils"] = at_ns, values[:, :3]
+        records = np.zeros(len(at_ns), sample(self._coils))
+        records["at_ns"], records["coils"] = at_ns, values[:, : self._coils]
         self._file.write(records.tobytes())
 
     def _set(self, channels: list[int], values: Any) -> None:
@@ -153,7 +155,7 @@ class NiTwin(rpc.NiDAQmxServicer):
             if device != DEVICE:
                 raise NiError(-200220)
             found = re.fullmatch(r"ao(\d+)(?::(?:ao)?(\d+))?", outputs)
-            if found is None or int(found[2] or found[1]) >= OUTPUTS:
+            if found is None or int(found[2] or found[1]) >= len(self.outputs):
                 raise NiError(-200170)
             task.channels += range(int(found[1]), int(found[2] or found[1]) + 1)
         if request.max_val > RANGE_V or request.min_val < -RANGE_V:
@@ -238,7 +240,7 @@ class NiTwin(rpc.NiDAQmxServicer):
         for task in self.tasks.values():
             task.error, task.began_ns = -88709, None
         if self._reset_zeroes:
-            self._set(list(range(OUTPUTS)), 0.0)
+            self._set(list(range(len(self.outputs))), 0.0)
 
     def _reserve(self, task: Task) -> None:
         for other in self.tasks.values():
@@ -257,10 +259,10 @@ for _name in [name.removeprefix("on_") for name in vars(NiTwin) if name.startswi
     setattr(NiTwin, _name, _route(_name))
 
 
-def serve(file: Path, reset_zeroes: bool = True) -> tuple[grpc.Server, int, NiTwin]:
+def serve(file: Path, reset_zeroes: bool = True, coils: int = 3) -> tuple[grpc.Server, int, NiTwin]:
     """A running server, its port and what it serves."""
     server = grpc.server(futures.ThreadPoolExecutor(8))
-    twin = NiTwin(file, reset_zeroes)
+    twin = NiTwin(file, reset_zeroes, coils)
     rpc.add_NiDAQmxServicer_to_server(twin, server)
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
@@ -268,7 +270,7 @@ def serve(file: Path, reset_zeroes: bool = True) -> tuple[grpc.Server, int, NiTw
 
 
 if __name__ == "__main__":
-    running, bound, _twin = serve(Path(sys.argv[1]), reset_zeroes=len(sys.argv) < 3)
+    running, bound, _twin = serve(Path(sys.argv[1]), reset_zeroes=len(sys.argv) < 4, coils=int((*sys.argv, 3)[2]))
     prioritise_process(Priority.GUARDIAN + 1)  # a device does not wait for the computer's other work
     print(bound, flush=True)
     sys.stdin.read()

@@ -25,7 +25,6 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.stages.config import ResolvedConfig
 from flowrec.stages.pipeline import Pipeline
 from tests.twins.coils import Device
-from tests.twins.firmware import SAMPLE
 
 _FILES = 3  # of the folder; the emulator reads one after the other, and keeps a file in memory where there is only one
 _LATE_NS = 5_000_000  # after a moment its samples are in the file
@@ -64,7 +63,7 @@ class Rolled:
         times_ns, currents = self._coils.outputs(self._byte)
         if not len(times_ns):
             return
-        self._byte += len(times_ns) * SAMPLE.itemsize
+        self._byte += len(times_ns) * self._coils.sample_bytes
         self.energised |= bool(currents.any())
         field = np.concatenate([self._field, currents @ self._mt_per_a.T])
         before, after = field[:-1], field[1:]

@@ -10,7 +10,7 @@ Points are (x, y); arrays are [row, column] = [y, x]. Stamps are nanoseconds on 
 
 from flowrec.core.messages.control import AxesCheck, Currents, Demand, Event, Mission
 from flowrec.core.messages.estimation import Estimate, Health, Observations
-from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, OperatorEvent, Truth, pixel_type
+from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, Measured, OperatorEvent, Truth, pixel_type
 from flowrec.core.messages.slow_stages import FlowField, Route
 from flowrec.core.messages.vision import Appearance, Background, Shift, Track, shift_px
 
@@ -27,6 +27,7 @@ __all__ = [
     "FlowField",
     "Frame",
     "Health",
+    "Measured",
     "Mission",
     "Observations",
     "OperatorEvent",

@@ -131,6 +131,10 @@ class Currents(Message):
     plane_rad: Annotated[float, "heading of the plane of rotation; it turns towards heading_rad or its opposite"] = 0.0
     limit_hz: Annotated[float, "step-out frequency at this amplitude; the field's direction never turns faster"] = 0.0
     voltages_v: Annotated[Vector, Shape("n"), "inputs of the amplifiers, one a coil; (0,) in older files"] = NOT_STATED
+    unmet_mt: Annotated[
+        float,
+        "amplitude that the settings ask for and the limits of current and voltage do not permit; 0 in older files",
+    ] = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

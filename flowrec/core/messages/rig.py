@@ -98,6 +98,15 @@ class Applied(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Measured(Message):
+    """Currents that an amplifier has measured, at the stamp of the measurement."""
+
+    stamp_ns: int
+    currents_a: Annotated[PerCoil, "measured current of each coil"]
+    put_out_a: Annotated[PerCoil, "current of each coil that the amplifier was to put out at that time"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class OperatorEvent(Message):
     """An action of the operator."""
 

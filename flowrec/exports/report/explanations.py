@@ -39,6 +39,7 @@ MEANINGS: dict[str, str] = {
     "navigation_s": "taken for the route",
     "latest_goal": "set by the operator during the run",
     "speed_limit_um_s": "set by the operator, of the robot through the fluid",
+    "unmet_mt": "of coils.amplitude_mt, what the limits of current and voltage of the coils did not permit",
     "contacts": "counted by the simulation",
     "assumed_method": "how the flow was computed before the run",
     "assumed_flow_error": "root mean square difference from the simulated true flow, relative to that flow",

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.core import Applied, Currents, RigError, UsageError
+from flowrec.core import Applied, Currents, Measured, RigError, UsageError
 from flowrec.rigs.lab.amplifiers.amplifier import Amplifier, AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits, ReadBack
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
 from flowrec.stages import AMPLIFIERS, FieldCommand, FieldLog
 
@@ -77,6 +77,7 @@ class Drive:
         self._taken_away = False  # by zero(), in any thread: one attribute, no lock
         self._command = _REST
         self._commanded_s = self._on_until_s = 0.0
+        self._read_back = ReadBack(None, 0.0)
         self._accounted: tuple[int, int, np.ndarray] | None = None  # the last frame's times, and its turns
 
     def __enter__(self) -> Self:
@@ -103,6 +104,7 @@ class Drive:
             self._stack = stack.pop_all()
         self._taken_away = False
         self._command, self._accounted = _REST, None
+        self._read_back = ReadBack(self._limits.output.measured_within_a, self._limits.output.measured_after_s)
         self._commanded_s = self._clock()
         return self
 
@@ -151,6 +153,11 @@ class Drive:
             self._accounted = (before_ns, stamp_ns, result.turns)
         return replace(result, turns=result.turns + late)
 
+    def measured(self) -> Measured | None:
+        """The latest measurement of the currents; None: there is none, or the amplifier does not measure."""
+        measured: Measured | None = self._amplifier.measured() if self.info.measures else None  # type: ignore[attr-defined]
+        return measured
+
     def put_out(self, until_ns: int) -> FieldLog:
         """Log of the field that was put out up to a time of the host's monotonic clock."""
         return self._amplifier.put_out(until_ns)
@@ -183,6 +190,9 @@ class Drive:
         try:
             # The guardian knows first, so that no field is on without it.
             guardian.beat(energised=now_s < self._on_until_s)
+            fault = self._read_back.fault(self.measured())
+            if fault:
+                raise RigError(f"{self.info.model}: {fault}")
             self._amplifier.apply(command)
         except RigError:
             with contextlib.suppress(RigError):  # the first error says what happened

@@ -20,7 +20,7 @@ from functools import partial
 
 import numpy as np
 
-from flowrec.core import Applied, CameraLosses, Currents, Fit, Frame, Image, RigError, UsageError, nanoseconds
+from flowrec.core import Applied, CameraLosses, Currents, Fit, Frame, Image, Measured, RigError, UsageError, nanoseconds
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import CAUSES, Captured, Grabber
 from flowrec.rigs.lab.drive import BEAT_S, Drive
@@ -82,6 +82,7 @@ class LabRig:
         self._config = config
         self._duration_ns = None if duration_s is None else nanoseconds(duration_s)
         self._connection = ExitStack()
+        self._told_measured: Measured | None = None
         self._told: set[str] = set()  # notes about the camera
         self._absent = False  # for the loop's thread only
 
@@ -156,7 +157,7 @@ class LabRig:
             applied = self._field_between(session, stamp_ns, before_ns)
             applied = replace(applied, absent_until_ns=absent_until_ns)
             if frame is None:
-                yield Inputs(stamp_ns, None, applied)
+                yield Inputs(stamp_ns, None, applied, measured=self._measured(session))
             else:
                 losses, before = session.losses(frame.losses), losses
                 if losses is not before:  # about once a second
@@ -167,6 +168,7 @@ class LabRig:
                     applied,
                     clock=session.fit(frame.clock),
                     losses=losses,
+                    measured=self._measured(session),
                 )
             before_ns = stamp_ns
             frame = self._next(grabber)
@@ -247,9 +249,17 @@ class LabRig:
         if self.drive is not None:
             self.drive.beat()
 
+    def _measured(self, session: _Session) -> Measured | None:
+        """The latest measurement of the currents, on the session clock; None: none is new."""
+        measured = None if self.drive is None else self.drive.measured()
+        if measured is None or measured is self._told_measured:
+            return None
+        self._told_measured = measured
+        return replace(measured, stamp_ns=session.stamp_ns(measured.stamp_ns))
+
     def _field_between(self, session: _Session, stamp_ns: int, before_ns: int | None) -> Applied:
         if self.drive is None:
-            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(self._config.coils.count), np.zeros(2))
         begin_ns = None if before_ns is None else session.monotonic_ns(before_ns)
         return replace(self.drive.applied_at(session.monotonic_ns(stamp_ns), begin_ns), stamp_ns=stamp_ns)
 

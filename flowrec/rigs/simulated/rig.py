@@ -47,7 +47,7 @@ from flowrec.stages import (
     registration_of,
 )
 
-_COILS = 3  # x, y and z
+_COILS = 3  # of a rig without settings of coils
 _SKEW_PPM = 50.0  # of a crystal, at most
 _STEADY_S = 0.1  # a field that has not risen for so long is up
 _STARTED_S = 3600.0  # ago, at most
@@ -159,6 +159,7 @@ class SimulatedRig:
         self._delay_ns = nanoseconds(self._true_robot.delay_s)
         self._now_ns = 0
         self._coils = coils
+        self._count = _COILS if coils is None else coils.count
         self._true_coils = TrueCoils.of(coils, simulated)
         # For how much longer the robot is held at its start, and the field's strength before; None: it is not held.
         self._hold: tuple[float, float] | None = (hold_s, 0.0) if hold_s > 0.0 else None
@@ -284,7 +285,7 @@ class SimulatedRig:
         while True:
             if self._cut:
                 self._coming.clear()
-                self._acting = Currents(now, 0.0, 0.0, 0.0, 0.0, np.zeros(_COILS), False)
+                self._acting = Currents(now, 0.0, 0.0, 0.0, 0.0, np.zeros(self._count), False)
             switch = self._coming[0][0] if self._coming else until_ns
             end = min(max(switch, now), until_ns)
             lasts_s = seconds(end - now)
@@ -330,7 +331,7 @@ class SimulatedRig:
     def _field_message(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
         command, now = self._acting, self._rotation
         if command is None:
-            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(_COILS), turns)
+            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(self._count), turns)
         currents = command.currents_a
         if self._coils is not None:
             field = self._coils.field_mt(now.phase_rad, now.plane_rad, command.amplitude_mt)

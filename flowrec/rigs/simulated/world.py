@@ -17,7 +17,7 @@ from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, 
 from flowrec.rigs.simulated.hindrance import NO_HINDRANCE, Hindrance, walls_around
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.true_walls import at_centres, on_pixels, origin_um, true_walls
-from flowrec.stages import Coils, Simulated
+from flowrec.stages import Coils, Simulated, field_limits
 
 _STREAM = 7  # of the seed; bodies, microscope, chip and clock have 1 to 6 and 8
 # In the order of their random numbers; new ones at the end.
@@ -175,8 +175,8 @@ class TrueCoils:
         if coils is None or error == 0.0:
             return None
         stated = np.array(coils.mt_per_a)
-        draws = drawn_from(simulated.seed, "coils").uniform(-1.0, 1.0, (3, 3))
-        return cls(coils, np.eye(3) + error * draws * np.linalg.norm(stated, axis=0) @ np.linalg.inv(stated))
+        draws = drawn_from(simulated.seed, "coils").uniform(-1.0, 1.0, stated.shape)
+        return cls(coils, np.eye(3) + error * draws * np.linalg.norm(stated, axis=0) @ field_limits(coils).inverse)
 
     def motion(self, heading_rad: float) -> tuple[float, float]:
         """The direction in which the robot travels when this heading is asked for, and the field's strength, 1: full.

@@ -7,7 +7,8 @@ time (time_s, or in another unit, or dates: `Table.times_s`) and, of these, the 
   should travel.
 - b_x_mt, b_y_mt, b_z_mt: the field, sampled so often that it turns by less than a third of a revolution between rows.
 - turns_x, turns_y: revolutions since the row before, with amplitude_mt: applied.csv of `flowrec export --format csv`.
-- i_x_a, i_y_a, i_z_a: the currents, likewise; the field is coils.mt_per_a times the currents, plus coils.bias_mt.
+- i_x_a, i_y_a, i_z_a, of more than three coils i_1_a, i_2_a, ...: the currents, likewise; the field is coils.mt_per_a
+  times the currents, plus coils.bias_mt.
 
 Of a sampled field the rotation from each row to the next is about the axis B1 x B2. A roller on the floor travels along
 axis x z: with B = z cos theta + h sin theta, as in coils.py, the axis is z x h, and (z x h) x z = h. A helix travels
@@ -25,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec.core import DATES, NS_PER_S, TIME_UNITS, Floats, MovieError, Table, read_table
+from flowrec.core import DATES, NS_PER_S, TIME_UNITS, Floats, MovieError, Table, coil_names, read_table
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.control.field_log import FieldLog
 from flowrec.stages.rig_settings import Column, Columns
@@ -33,10 +34,9 @@ from flowrec.stages.rig_settings import Column, Columns
 _ROTATING = ("frequency_hz", "heading_deg", "amplitude_mt")
 _IN_RADIANS = ("frequency_hz", "heading_rad", "amplitude_mt")
 _OTHER_TIMES = (*list(TIME_UNITS)[1:], DATES)
-_CURRENTS = ("i_x_a", "i_y_a", "i_z_a")
 _FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
 _TURNS = ("turns_x", "turns_y", "amplitude_mt")
-_KINDS = (_TURNS, _ROTATING, _IN_RADIANS, _FIELDS, _CURRENTS)
+_KINDS: tuple[tuple[str, ...], ...] = (_TURNS, _ROTATING, _IN_RADIANS, _FIELDS)
 _LARGEST_STEP_RAD = 2.0 * math.pi / 3.0
 # Units in brackets at the end of a column's name, and what such a column holds.
 _BY_UNIT = {
@@ -79,7 +79,8 @@ def read_coil_log(
     table = read_table(path)
     if not table.rows:
         raise MovieError(f"{path}: has no rows below its header")
-    kind = _kind_of(table, columns)
+    of_currents = current_columns(coils.count)
+    kind = _kind_of(table, columns, (*_KINDS, of_currents))
     times_s = _times_s(table, columns)
     back = np.flatnonzero(np.diff(times_s) < 0.0)
     if len(back):
@@ -100,7 +101,7 @@ def read_coil_log(
         frequency, amplitude = np.abs(frequency), np.abs(amplitude)
     else:
         field = np.column_stack(values)
-        if kind == _CURRENTS:
+        if kind == of_currents:
             currents = field
             field = currents @ np.array(coils.mt_per_a).T + np.array(coils.bias_mt)
         frequency, heading, amplitude = _rotation(times_s, field, coils, str(path))
@@ -109,17 +110,22 @@ def read_coil_log(
     return FieldLog(times_ns, frequency, np.remainder(heading + math.pi, 2.0 * math.pi) - math.pi, amplitude, currents)
 
 
-def _kind_of(table: Table, columns: Columns) -> tuple[str, str, str]:
+def current_columns(coils: int) -> tuple[str, ...]:
+    """The columns of a table that hold the currents of so many coils."""
+    return tuple(f"i_{name}_a" for name in coil_names(coils))
+
+
+def _kind_of(table: Table, columns: Columns, kinds: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
     """The columns that the log is read by."""
-    missing: dict[tuple[str, str, str], list[str]] = {}
-    for kind in _KINDS:
+    missing: dict[tuple[str, ...], list[str]] = {}
+    for kind in kinds:
         lacks = [name for name in ("time_s", *kind) if not _has(table, columns, name)]
         if not lacks:
             return kind
         missing[kind] = lacks
-    nearest = min(_KINDS[1:], key=lambda kind: len(missing[kind]))
+    nearest = min(kinds[1:], key=lambda kind: len(missing[kind]))
     lacks = missing[nearest]
-    given = getattr(columns, lacks[0])
+    given = getattr(columns, lacks[0], None)
     if given is not None:
         raise MovieError(
             f"{table.where}: no column {_name(given)!r}; its columns are {', '.join(table.header)}; correct "

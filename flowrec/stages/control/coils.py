@@ -1,21 +1,31 @@
-"""The coil stage: from a demanded velocity to a rotating field and the three coil currents."""
+"""The coil stage: from a demanded velocity to a rotating field and the currents of the coils."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flowrec.core import Currents, Demand, Floats, Range, UsageError, seconds
+from flowrec.core import Currents, Demand, Floats, Range, UsageError, coil_names, seconds
 from flowrec.physics import Robot
-from flowrec.stages.control.amplifier import WORST_CONDITION, AmplifierSettings, FieldLimits, PerCoil, direction_name
+from flowrec.stages.control.amplifier import (
+    WORST_CONDITION,
+    AmplifierSettings,
+    FieldLimits,
+    direction_name,
+    shared_inverse,
+)
 from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
 
-Matrix3 = tuple[PerCoil, PerCoil, PerCoil]
+_Row = tuple[float, ...]
+_Matrix = tuple[_Row, _Row, _Row]
+_AXES = 3
+_LEAST_ROW = 1e-9  # A per mT of a coil that makes no field, such as a Maxwell pair
+_PER_COIL = ("a_per_v", "v_per_v", "resistance_ohm", "inductance_mh")  # settings of [coils.amplifier]
 _FADE_FRACTION = 0.1  # below this fraction of the full amplitude the bias compensation fades with the field
 
 
@@ -35,10 +45,10 @@ class Coils:
     surface: Literal["floor", "ceiling"] = "floor"  # surface on which a roller rolls
     handedness: Literal["right", "left"] = "right"  # handedness of a helix
     amplitude_mt: Annotated[float, Range(1e-3, 1e3)] = 4.0  # amplitude B0 of the rotating field
-    # field at the robot (rows) per coil current (columns)
-    mt_per_a: Annotated[Matrix3, Range(-1e4, 1e4)] = ((2.1, 0.0, 0.0), (0.0, 1.9, 0.0), (0.0, 0.0, 1.5))
+    # field at the robot (rows: along x, y, z) per coil current (columns: three coils or more, in the order of outputs)
+    mt_per_a: Annotated[_Matrix, Range(-1e4, 1e4)] = ((2.1, 0.0, 0.0), (0.0, 1.9, 0.0), (0.0, 0.0, 1.5))
     # field without currents: of the earth and the microscope
-    bias_mt: Annotated[PerCoil, Range(-1e3, 1e3)] = (0.0, 0.0, 0.0)
+    bias_mt: Annotated[tuple[float, float, float], Range(-1e3, 1e3)] = (0.0, 0.0, 0.0)
     max_current_a: Annotated[float, Range(1e-3, 1e3)] = 5.0  # largest current of a coil
     ramp_s: Annotated[float, Range(0.0, 60.0)] = 0.2  # time from zero to the full amplitude and back
     amplifier: AmplifierSettings = field(default_factory=AmplifierSettings)
@@ -65,7 +75,7 @@ class Coils:
         heading = previous.heading_rad if previous is not None else 0.0
         if speed_um_s > 1e-6:
             heading = math.atan2(demand.velocity_um_s[1], demand.velocity_um_s[0])
-        frequency_hz = min(speed_um_s / robot.um_per_rev, limit_hz)
+        frequency_hz = min(robot.frequency_hz(speed_um_s / robot.um_per_rev), limit_hz)
         state = FieldState(now.phase_rad, now.plane_rad if now.amplitude_mt > 0.0 else heading, amplitude_mt)
         command = FieldCommand(frequency_hz, heading, amplitude_mt, limit_hz, self.ramp_mt_s)
         currents_a, voltages_v = self._outputs_now(state, command)
@@ -80,6 +90,7 @@ class Coils:
             plane_rad=state.plane_rad,
             limit_hz=limit_hz,
             voltages_v=voltages_v,
+            unmet_mt=max(self.amplitude_mt - full_mt, 0.0),
         )
 
     def full_mt(self, robot: Robot) -> float:
@@ -88,7 +99,18 @@ class Coils:
 
     def fastest_um_s(self, robot: Robot) -> float:
         """Speed of the robot at the highest frequency at which it follows that amplitude."""
-        return robot.um_per_rev * _follow_hz(robot) * min(self.full_mt(robot) / self.amplitude_mt, 1.0)
+        if not robot.speed_at_hz:
+            return robot.um_per_rev * _follow_hz(robot) * min(self.full_mt(robot) / self.amplitude_mt, 1.0)
+        return robot.um_per_rev * robot.proportional_hz(self.fastest_hz(robot))
+
+    def fastest_hz(self, robot: Robot) -> float:
+        """The highest frequency of the field at which the robot follows that amplitude."""
+        return _follow_hz(robot) * min(self.full_mt(robot) / self.amplitude_mt, 1.0)
+
+    @property
+    def count(self) -> int:
+        """Number of coils."""
+        return len(self.mt_per_a[0])
 
     @property
     def ramp_mt_s(self) -> float:
@@ -115,7 +137,7 @@ class Coils:
         return np.stack([horizontal * x, horizontal * y, amplitude * np.cos(phase)], -1)
 
     def currents_a(self, field_mt: Floats, amplitude_mt: ArrayLike) -> Floats:
-        """(..., 3) coil currents for a field (..., 3) of an amplitude (...): i = A^-1 (B - b).
+        """(..., n) currents of n coils for a field (..., 3) of an amplitude (...): i = A^-1 (B - b).
 
         Below a tenth of the full amplitude the compensation of the bias b is reduced in proportion, so that zero field
         means zero currents, without a step.
@@ -125,7 +147,7 @@ class Coils:
         return field_mt @ limits.inverse.T - weight[..., None] * limits.bias_a
 
     def output_samples(self, state: FieldState, command: FieldCommand, count: int) -> tuple[Floats, Floats]:
-        """Currents (count + 1, 3) at the output samples from now on, and the voltages (count, 3) held in between."""
+        """Currents (count + 1, n) at the output samples from now on, and the voltages (count, n) held in between."""
         rate = self.amplifier.output_hz
         time, motion = np.arange(count + 1) / rate, field_motion(state, command)
         amplitude = motion.amplitude(time)
@@ -133,7 +155,7 @@ class Coils:
         return currents, self.amplifier.sample_and_hold_v(currents, 1.0 / rate)
 
     def _outputs_now(self, state: FieldState, command: FieldCommand) -> tuple[Floats, Floats]:
-        """Currents (3,) now and voltages (3,) of the first sample: `output_samples` of one, in plain numbers.
+        """Currents (n,) now and voltages (n,) of the first sample: `output_samples` of one, in plain numbers.
 
         Every tick asks for it, and NumPy takes ten times as long for as few numbers.
         """
@@ -144,7 +166,7 @@ class Coils:
         return np.array(now), np.array(volts)
 
     def _currents_of(self, state: FieldState) -> list[float]:
-        """Coil currents (3) of a state of the field, by the equations of `field_mt` and `currents_a`."""
+        """Coil currents (n) of a state of the field, by the equations of `field_mt` and `currents_a`."""
         inverse, bias_a = _inverse_and_bias(self)
         amplitude, c, s = state.amplitude_mt, math.cos(state.plane_rad), math.sin(state.plane_rad)
         horizontal = self._sense * amplitude * math.sin(state.phase_rad)
@@ -170,12 +192,13 @@ class Coils:
         UsageError : one line, the key first.
         """
         amplifier = self.amplifier
+        self._check_counts(where)
         _, gain, directions = np.linalg.svd(np.array(self.mt_per_a).T)
         if gain[-1] * WORST_CONDITION <= gain[0]:
             raise UsageError(
                 f"{where}: coils.mt_per_a: no currents make a field along {direction_name(directions[-1])} "
-                f"({gain[-1]:.3g} mT/A, {gain[0]:.3g} in the best direction); the fields of the three coils must be "
-                "linearly independent; flowrec calibrate coils measures them"
+                f"({gain[-1]:.3g} mT/A, {gain[0]:.3g} in the best direction); the fields of the "
+                f"{_count_words(self.count)} coils must be linearly independent; flowrec calibrate coils measures them"
             )
         if amplifier.kind == "voltage" and self.ramp_s == 0.0:
             raise UsageError(f"{where}: coils.ramp_s = 0: a voltage amplifier needs time for a current; try 0.2")
@@ -186,9 +209,26 @@ class Coils:
         ):
             coil = int(np.argmin(available))
             if available[coil] <= 0.0:
+                name = coil_names(self.count)[coil]
                 raise UsageError(
-                    f"{where}: {key} = {limit}: coil {'xyz'[coil]} needs all of it against coils.bias_mt "
+                    f"{where}: {key} = {limit}: coil {name} needs all of it against coils.bias_mt "
                     f"({limits.bias_a[coil]:+.3g} A) and for the ramp; raise it, or shield the bias"
+                )
+
+    def _check_counts(self, where: str) -> None:
+        """Refuse numbers that are not one for each coil."""
+        counts = [len(row) for row in self.mt_per_a]
+        if min(counts) < _AXES or len(set(counts)) > 1:
+            raise UsageError(
+                f"{where}: coils.mt_per_a: rows of {', '.join(map(str, counts))} numbers; give three rows, for the "
+                f"field along x, y and z, each with one number for each coil, of which a rotating field needs {_AXES}"
+            )
+        for key in _PER_COIL:
+            given = getattr(self.amplifier, key)
+            if isinstance(given, tuple) and len(given) != self.count:
+                raise UsageError(
+                    f"{where}: coils.amplifier.{key}: {len(given)} numbers, where coils.mt_per_a has {self.count} "
+                    "columns; give one number for all coils, or one for each"
                 )
 
     def _ramp(self, last_mt: float, dt_s: float, target_mt: float) -> float:
@@ -217,19 +257,28 @@ def _inverse_and_bias(coils: Coils) -> tuple[list[list[float]], list[float]]:
 def _hold_ohm(coils: Coils) -> tuple[list[float], list[float]]:
     """Volts of each coil per ampere at the beginning of an output sample, and per ampere of change within it."""
     amplifier = coils.amplifier
-    return amplifier.ohm.tolist(), amplifier.slope_ohm(1.0 / amplifier.output_hz).tolist()
+    held = amplifier.ohm, amplifier.slope_ohm(1.0 / amplifier.output_hz)
+    ohm, slope_ohm = (np.broadcast_to(each, coils.count).tolist() for each in held)
+    return ohm, slope_ohm
 
 
 @lru_cache(maxsize=16)
 def field_limits(coils: Coils) -> FieldLimits:
     """Limits of the field by coils and amplifier; constant during a run."""
-    inverse = np.linalg.inv(np.array(coils.mt_per_a))
+    matrix = np.array(coils.mt_per_a)
+    if coils.count == _AXES:
+        return _limits_with(coils, np.linalg.inv(matrix))
+    return _limits_with(coils, shared_inverse(matrix, partial(_limits_with, coils)))
+
+
+def _limits_with(coils: Coils, inverse: Floats) -> FieldLimits:
+    """The limits if the currents of a field are those of a matrix (n, 3), A per mT."""
     bias_a = inverse @ np.array(coils.bias_mt)
-    row = np.linalg.norm(inverse, axis=1)
-    ohm, henry = coils.amplifier.ohm, coils.amplifier.henry
+    row = np.maximum(np.linalg.norm(inverse, axis=1), _LEAST_ROW)
+    ohm, henry = (np.broadcast_to(each, coils.count) for each in (coils.amplifier.ohm, coils.amplifier.henry))
     # While the amplitude ramps, and the bias compensation with it, L di/dt is larger by at most this.
     a_per_mt_ramp = row + np.abs(bias_a) / coils.fade_mt
-    ramp_a_s = coils.ramp_mt_s * a_per_mt_ramp if coils.ramp_s > 0.0 else np.zeros(3)
+    ramp_a_s = coils.ramp_mt_s * a_per_mt_ramp if coils.ramp_s > 0.0 else np.zeros(coils.count)
     return FieldLimits(
         inverse=inverse,
         bias_a=bias_a,
@@ -241,3 +290,7 @@ def field_limits(coils: Coils) -> FieldLimits:
         henry=henry,
         nominal_mt=coils.amplitude_mt,
     )
+
+
+def _count_words(count: int) -> str:
+    return "three" if count == _AXES else str(count)

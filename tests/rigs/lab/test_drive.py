@@ -21,14 +21,13 @@ from flowrec.core.errors import FlowrecError, RigError
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import Drive
 from flowrec.rigs.lab.guardian import Guardian
-from flowrec.stages.control.coils import field_limits
 from flowrec.stages.control.field_rotation import FieldCommand
 from flowrec.stages.rig_settings import OutputLimits
 from tests.conftest import needs_quiet, until
 from tests.extras import why
 from tests.perf.guardian import sleeper, trial
-from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, amplifier, currents
-from tests.twins.coils import CHANNELS, Device, device
+from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, SIX_COILS, amplifier, coils_of, currents
+from tests.twins.coils import Device, channels, device
 
 pytestmark = needs_quiet
 
@@ -49,7 +48,20 @@ def ni(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
         yield on
 
 
-@pytest.fixture(params=["serial", "ni"])
+@pytest.fixture(scope="module")
+def serial_of_six(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
+    with device("serial", tmp_path_factory.mktemp("serial6"), coils=6) as on:
+        yield on
+
+
+@pytest.fixture(scope="module")
+def ni_of_six(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
+    pytest.importorskip("nidaqmx", reason=why("nidaqmx"))
+    with device("ni", tmp_path_factory.mktemp("ni6"), coils=6) as on:
+        yield on
+
+
+@pytest.fixture(params=["serial", "ni", "serial_of_six", "ni_of_six"])
 def on(request: pytest.FixtureRequest) -> Device:
     found: Device = request.getfixturevalue(request.param)
     return found
@@ -58,7 +70,8 @@ def on(request: pytest.FixtureRequest) -> Device:
 @contextlib.contextmanager
 def driven(on: Device, seconds: float = 0.0) -> Iterator[tuple[Drive, int, int]]:
     """A drive after so many seconds of commands, and the times of its first and last command."""
-    with Drive(amplifier(on.kind, on.address, 5.0), CommandLimits(COILS, ROBOT, OUTPUT), 1.0, 5.0) as drive:
+    coils = coils_of(on.coils)
+    with Drive(amplifier(on.kind, on.address, 5.0, coils), CommandLimits(coils, ROBOT, OUTPUT), 1.0, 5.0) as drive:
         begin_ns, number = time.monotonic_ns(), 0
         while time.monotonic_ns() < begin_ns + seconds * 1e9:
             drive.apply(currents(8.0 + 6.0 * math.sin(0.05 * number), 0.03 * number))
@@ -76,10 +89,11 @@ def test_the_turns_that_are_logged_are_those_of_the_field_that_was_put_out(on: D
         full_ns = begin_ns + 600_000_000  # after the ramp and the latency: the bias compensation is complete
         found = drive.put_out(time.monotonic_ns()).turns(full_ns, now_ns)
     times, outputs = on.outputs(begin)
+    coils = coils_of(on.coils)
+    assert np.abs(outputs).max() <= coils.max_current_a * 1.00001, "also on the ways up and down"
     kept = (times >= full_ns) & (times <= now_ns)
-    bias = field_limits(COILS).bias_a
-    field = (outputs[kept] + bias) @ np.array(COILS.mt_per_a).T
-    assert np.linalg.norm(field, axis=1).min() > 3.9
+    field = outputs[kept] @ np.array(coils.mt_per_a).T + np.array(coils.bias_mt)
+    np.testing.assert_allclose(np.linalg.norm(field, axis=1), coils.full_mt(ROBOT), rtol=0.005)
     # The horizontal heading h of a roller: z turns towards h, so z x h is the axis, and b x db its direction.
     b = field / np.linalg.norm(field, axis=1)[:, None]
     axis = np.cross(b[:-1], b[1:]).sum(axis=0) / (2 * math.pi)
@@ -145,6 +159,32 @@ def test_a_board_that_has_gone_to_zero_by_itself_ends_the_run(tmp_path: Path) ->
         assert on.off_ns(0) is not None
 
 
+def test_a_coil_that_has_half_of_its_current_is_noticed_by_its_sensor_and_ends_in_zero(tmp_path: Path) -> None:
+    checked = OutputLimits(measured_within_a=0.3, measured_after_s=0.05)
+    fault = tmp_path / "fault"
+    with (
+        device("serial+sensors", tmp_path) as on,
+        Drive(amplifier("serial", on.address), CommandLimits(COILS, ROBOT, checked), 1.0, 5.0) as drive,
+    ):
+        assert drive.info.measures
+        for _ in range(60):
+            drive.apply(currents(8.0, 0.0))
+            time.sleep(0.015)
+        measured = drive.measured()
+        assert measured is not None and np.abs(measured.currents_a).max() > 1.0
+        np.testing.assert_allclose(measured.currents_a, measured.put_out_a, atol=1e-4)
+        fault.touch()
+        begin_ns = time.monotonic_ns()
+        with pytest.raises(RigError, match=r"flowrec-coils: coil x has .* A where .* A are put out, for \d+ ms"):
+            commanded(drive)
+        assert time.monotonic_ns() - begin_ns < 1e9
+        off_ns = on.off_ns(begin_ns)
+        assert off_ns is not None and (off_ns - begin_ns) * 1e-9 < 0.2 + SLACK_S
+        drive.apply(currents(8.0, 0.0))
+        time.sleep(0.05)
+        assert on.off_ns(begin_ns) == off_ns
+
+
 def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
     begin = on.end()
     with driven(on, 0.4) as (drive, begin_ns, _):
@@ -190,7 +230,7 @@ def obeying(on: Device, monkeypatch: pytest.MonkeyPatch, silence_s: float) -> It
     thread.start()
     begin = on.end()
     try:
-        ours.send(("open", ni_process.NiSettings(CHANNELS, on.address, COILS, ROBOT, OUTPUT, silence_s)))
+        ours.send(("open", ni_process.NiSettings(channels(COILS.count), on.address, COILS, ROBOT, OUTPUT, silence_s)))
         assert ours.recv()[0] == "info"
         ours.send(("arm",))
         assert ours.recv()[0] == "armed"
@@ -240,6 +280,8 @@ def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
         (amplifier("serial", str(tmp_path / "ttyNone")), COILS, "ports here"),
         (amplifier("serial", serial.address), strong, "coils.max_current_a = 7 A: flowrec-coils makes at most 5 A"),
         (amplifier("ni", "127.0.0.1:1"), COILS, "no NI gRPC Device Server"),
+        (amplifier("serial", serial.address, coils=SIX_COILS), SIX_COILS, "drives 3 coils, where coils.mt_per_a has 6"),
+        (amplifier("ni", ni.address, coils=SIX_COILS), SIX_COILS, "the device has no such output"),
     ]
     for given, coils, words in cases:
         with (

@@ -121,7 +121,7 @@ def test_it_puts_out_the_field_of_field_rotation_and_counts_its_turns(board: Boa
     assert np.percentile(error, 99) < 0.06 and error.max() < 0.25
     (last,) = board.field(ON)
     assert last is not None
-    counted = telemetry(last)
+    counted = telemetry(last, COILS.count)
     assert counted is not None
     np.testing.assert_allclose(np.array(counted.turns) * 1e-6, turns, atol=0.03)
 

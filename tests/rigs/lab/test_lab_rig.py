@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from flowrec.core.errors import FlowrecError, RigError, UsageError
-from flowrec.core.messages import Applied, Currents
+from flowrec.core.messages import Applied, Currents, Measured
 from flowrec.physics.chip.io import chip_files, load_chip
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
@@ -85,6 +85,7 @@ class Noted:
         self.calls: deque[str] = deque()
         self.beats: list[float] = []
         self.beats_before_rest = self.looked_at = 0
+        self.latest: Measured | None = None
 
     def __enter__(self) -> Noted:
         self.calls.append("enter")
@@ -108,6 +109,12 @@ class Noted:
 
     def zero(self) -> None:
         self.calls.append("zero")
+
+    def measured(self) -> Measured | None:
+        """Another measurement for every second frame."""
+        if self.looked_at % 2 == 0:
+            self.latest = Measured(time.monotonic_ns(), np.full(3, 0.1 * self.looked_at), np.zeros(3))
+        return self.latest
 
     def applied_at(self, stamp_ns: int, before_ns: int | None) -> Applied:
         self.looked_at += 1
@@ -160,6 +167,9 @@ def test_while_a_camera_is_absent_the_field_is_off_and_ticks_without_an_image_go
     turns = sum(inputs.applied.turns[0] for inputs, _ in seen)
     assert turns == pytest.approx(2.0 * stamps[-1] / 1e9), "no turn is lost between frames"
     assert seen[-1][0].losses.reconnections == 1
+    measured = [(inputs.stamp_ns, each) for inputs, _ in seen if (each := inputs.measured) is not None]
+    assert 0 < len(measured) <= 0.5 * len(seen) + 1, "each measurement once"
+    assert all(abs(each.stamp_ns - stamp_ns) < 1e9 for stamp_ns, each in measured), "on the clock of the session"
     off, back = (line for line in told if "clock" not in line)
     assert "the field is off until" in off and "back after" in back
 

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from flowrec.core.declarations import as_read
 from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import Currents
+from flowrec.core.messages import Currents, Measured
 from flowrec.physics.robot import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits, ReadBack
 from flowrec.rigs.lab.amplifiers.serial_protocol import field_line
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
 from flowrec.stages.control.amplifier import AmplifierSettings
@@ -104,6 +104,32 @@ def test_samples_beyond_a_limit_or_that_are_no_numbers_are_refused_whoever_made_
         limits.check_samples(rest, np.full((2, 3), 11.0))
     with pytest.raises(RigError, match="slew"):
         limits.check_samples(np.array([[0.0] * 3, [0.0] * 3, [0.2] * 3]), none)
+
+
+def measured(at_ms: float, *currents_a: float) -> Measured:
+    return Measured(round(1e6 * at_ms), np.array(currents_a), np.array([1.0, -1.0, 0.5]))
+
+
+def test_a_measured_current_that_differs_for_too_long_is_told_with_its_coil() -> None:
+    check = ReadBack(0.1, 0.05)
+    assert check.fault(None) == "" and ReadBack(None, 0.05).fault(measured(0, 9.0, 9.0, 9.0)) == ""
+    right, wrong = (1.05, -0.95, 0.5), (1.0, -0.5, 0.5)
+    assert [check.fault(measured(ms, *right)) for ms in (0, 100)] == ["", ""]
+    assert [check.fault(measured(ms, *wrong)) for ms in (200, 240)] == ["", ""]
+    assert check.fault(measured(245, *right)) == "", "it was right in between: the time begins anew"
+    assert [check.fault(measured(ms, *wrong)) for ms in (250, 299)] == ["", ""]
+    assert check.fault(measured(301, *wrong)).startswith("coil y has -0.5 A where -1 A are put out, for 51 ms")
+    with as_read():
+        blind = measured(400, math.nan, -1.0, 0.5)
+    assert ReadBack(0.1, 0.0).fault(blind), "a sensor that tells nothing does not agree"
+
+
+def test_currents_that_nobody_measures_can_not_be_compared() -> None:
+    asked = CommandLimits(CURRENT, ROBOT, OutputLimits(measured_within_a=0.1))
+    info = AmplifierInfo("board", "", 9.0, 99.0, 1e6, 0.01, 0.1)
+    with pytest.raises(UsageError, match=r"measured_within_a = 0\.1: board measures no currents"):
+        asked.check(info)
+    asked.check(replace(info, measures=True))
 
 
 def test_impossible_numbers_become_zero_field_and_are_told_once() -> None:

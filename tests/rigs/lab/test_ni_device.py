@@ -36,7 +36,7 @@ def server(tmp_path: Path) -> Iterator[tuple[str, NiTwin]]:
         ("", "lab.ni.channels: which outputs"),
         ("cDAQ1Mod1/ao2:4", "the device has no such output"),
         ("Dev9/ao0:2", "NI knows no such device"),
-        ("cDAQ1Mod1/ao0:1", "2 outputs, where three coils need 3"),
+        ("cDAQ1Mod1/ao0:1", "2 outputs, where the coils of coils.mt_per_a need 3"),
         ("cDAQ1Mod1/ao0,cDAQ1Mod1/ao0,cDAQ1Mod1/ao1", "an output is named twice"),
     ],
 )
@@ -44,7 +44,7 @@ def test_outputs_that_are_not_three_of_a_device_are_refused(
     channels: str, told: str, server: tuple[str, NiTwin]
 ) -> None:
     with pytest.raises(RigError, match=told) as refused:
-        NiDevice(channels, server[0], COILS.amplifier, 0.1)
+        NiDevice(channels, server[0], COILS.amplifier, 3, 0.1)
     assert "\n" not in str(refused.value)
 
 
@@ -52,7 +52,7 @@ def test_a_voltage_beyond_the_range_of_the_device_is_refused_by_the_name_of_its_
     server: tuple[str, NiTwin],
 ) -> None:
     strong = replace(COILS, amplifier=replace(COILS.amplifier, max_voltage_v=20.0))
-    info = NiDevice("cDAQ1Mod1/ao0:2", server[0], strong.amplifier, 0.1).info
+    info = NiDevice("cDAQ1Mod1/ao0:2", server[0], strong.amplifier, 3, 0.1).info
     with pytest.raises(UsageError, match=r"coils\.amplifier\.max_voltage_v = 20 V: NI 9263 makes at most 10 V"):
         CommandLimits(strong, ROBOT, OutputLimits()).check(info)
 
@@ -64,7 +64,7 @@ def test_outputs_that_another_program_uses_are_not_taken_from_it(server: tuple[s
         other.timing.cfg_samp_clk_timing(1000.0, sample_mode=AcquisitionType.CONTINUOUS, samps_per_chan=1000)
         other.write(np.full(1000, 2.0))
         other.start()
-        device = NiDevice("cDAQ1Mod1/ao0:2", address, COILS.amplifier, 0.1)
+        device = NiDevice("cDAQ1Mod1/ao0:2", address, COILS.amplifier, 3, 0.1)
         with pytest.raises(RigError, match=r"lab\.ni\.channels = .*: another program uses the outputs"):
             device.take()
         assert not other.is_task_done() and twin.outputs[1] == 2.0, "the other program goes on"

@@ -11,6 +11,7 @@ from flowrec.core.errors import UsageError
 from flowrec.core.system.outputs import OutputError
 from flowrec.measure.calibrate_coils import calibrate_coils, settings_of
 from flowrec.measure.coil_calibration import Excitations, advice, fit_coils, read_excitations
+from flowrec.measure.coil_windings import winding_of, windings_matrix
 from flowrec.measure.proposal import as_sets
 from flowrec.stages.config import load_config
 from flowrec.verbs.cli import app
@@ -174,3 +175,113 @@ def test_the_command_says_it_for_people_and_for_programs(tmp_path):
     figures = json.loads(CliRunner().invoke(app, ["calibrate", "coils", str(path), "--json"]).stdout)
     np.testing.assert_allclose(figures["mt_per_a"], A, atol=0.05)
     assert figures["degrees_of_freedom"] == 8 and len(figures["left_out_mt"]) == 12
+
+
+def of_six():
+    rng = np.random.default_rng(4)
+    matrix = rng.normal(size=(3, 6))
+    currents = np.concatenate([2 * np.eye(6), -2 * np.eye(6), rng.uniform(-2, 2, (12, 6))])
+    field = currents @ matrix.T + BIAS
+    rows = [",".join([*(f"i_{n}_a" for n in range(1, 7)), "b_x_mt", "b_y_mt", "b_z_mt"])]
+    rows += [",".join(f"{v:.9f}" for v in row) for row in np.column_stack([currents, field])]
+    return matrix, rows
+
+
+def test_a_table_of_six_coils_gives_a_matrix_of_six_columns_that_a_run_uses(tmp_path):
+    matrix, rows = of_six()
+    table, out = tmp_path / "six.csv", tmp_path / "six.toml"
+    table.write_text("\n".join(rows))
+    answer = CliRunner().invoke(app, ["calibrate", "coils", str(table), "-o", str(out), "--json"])
+    told = json.loads(answer.stdout)
+    np.testing.assert_allclose(told["mt_per_a"], matrix, atol=1e-7)
+    assert told["degrees_of_freedom"] == 24 - 7 and told["advice"] == []
+    coils = load_config(out).coils
+    assert coils.count == 6
+    np.testing.assert_allclose(coils.mt_per_a, matrix, atol=1e-6)
+    np.testing.assert_allclose(coils.bias_mt, BIAS, atol=1e-6)
+    shown = CliRunner().invoke(app, ["calibrate", "coils", str(table)]).stdout
+    assert "coil 1" in shown and "coil 6" in shown
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda rows: rows[:7], "6 rows; 6 coils and a bias take 7, and 8 to see any residual; 24 are recommended"),
+        (lambda rows: [rows[0].replace("i_5_a", "i_9_a"), *rows[1:]], "no column i_5_a; the header is i_1_a,i_2_a"),
+        (lambda rows: [rows[0].replace("i_6_a", "i_999999999_a"), *rows[1:]], "no column i_6_a"),
+        (lambda rows: [rows[0], *(f"0{row[row.index(',') :]}" for row in rows[1:])], "coil 1 was hardly driven"),
+    ],
+)
+def test_a_table_of_six_coils_that_lacks_something_is_refused_in_one_line(tmp_path, change, says):
+    table = tmp_path / "six.csv"
+    table.write_text("\n".join(change(of_six()[1])))
+    with pytest.raises(UsageError, match=says) as refused:
+        fit_coils(read_excitations(table))
+    assert "\n" not in str(refused.value)
+
+
+def loops_mt(radius_mm, turns, places_mm, senses, at_mm):
+    """Biot and Savart along loops about z, one ampere, summed over their parts."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 4001)[:-1]
+    step = radius_mm * (angle[1] - angle[0])
+    field = 0.0
+    for place_mm, sense in zip(places_mm, senses, strict=True):
+        part = np.column_stack([radius_mm * np.cos(angle), radius_mm * np.sin(angle), np.full(4000, place_mm)])
+        along = sense * step * np.column_stack([-np.sin(angle), np.cos(angle), np.zeros(4000)])
+        away = np.array([0.0, 0.0, at_mm]) - part
+        field += np.sum(np.cross(along, away) / np.linalg.norm(away, axis=1)[:, None] ** 3, axis=0)[2]
+    return 4e-7 * np.pi / (4.0 * np.pi) * turns * field * 1e6  # 1/mm to 1/m, T to mT
+
+
+def test_the_field_of_windings_is_that_of_the_law_of_biot_and_savart():
+    for text, places_mm, senses in (
+        ("z:helmholtz:50:120", (25.0, -25.0), (1, 1)),
+        ("z:pair:60:150:65", (32.5, -32.5), (1, 1)),
+        ("z:coil:40:100:30", (-30.0,), (1,)),
+        ("-z:coil:40:100:30", (-30.0,), (-1,)),
+    ):
+        one = winding_of(text)
+        assert one.mt_per_a == pytest.approx(loops_mt(one.radius_mm, one.turns, places_mm, senses, 0.0), rel=1e-5), text
+    maxwell = winding_of("z:maxwell:50:80")
+    half_mm = 0.5 * np.sqrt(3.0) * 50.0
+    two = [loops_mt(50.0, 80.0, (half_mm, -half_mm), (1, -1), at_mm) for at_mm in (-0.1, 0.1)]
+    assert maxwell.mt_per_a == 0.0 and sum(two) == pytest.approx(0.0, abs=1e-9)
+    assert maxwell.mt_per_mm_per_a == pytest.approx((two[1] - two[0]) / 0.2, rel=1e-4)
+
+
+def test_windings_make_the_configuration_of_a_run_a_column_for_each(tmp_path):
+    out = tmp_path / "coils.toml"
+    given = ["x:helmholtz:50:120", "y:pair:60:150:65", "z:coil:40:100:30", "-z:coil:40:100:30", "x:maxwell:50:80"]
+    words = [word for text in given for word in ("--winding", text)]
+    answer = CliRunner().invoke(app, ["calibrate", "coils", *words, "-o", str(out), "--json"])
+    assert answer.exit_code == 0, answer.stderr
+    coils = load_config(out).coils
+    np.testing.assert_allclose(coils.mt_per_a, json.loads(answer.stdout)["mt_per_a"], rtol=1e-5)
+    z, beside = coils.currents_a(np.array([[0.0, 0.0, 4.0]]), np.array([4.0]))[0][[2, 4]]
+    assert z == pytest.approx(0.5 * 4.0 / coils.mt_per_a[2][2]) and beside == 0.0, "two share, a Maxwell pair rests"
+
+
+@pytest.mark.parametrize(
+    ("texts", "says"),
+    [
+        (["q:coil:1:1:1"], r"--winding q:coil:1:1:1: give AXIS:KIND"),
+        (["x:ring:1:1"], "one of helmholtz, maxwell, pair, coil"),
+        (["x:helmholtz:50"], "1 numbers, where helmholtz takes radius and turns"),
+        (["x:pair:50:10"], "2 numbers, where pair takes radius, turns and distance"),
+        (["x:coil:50:10:far"], "could not convert"),
+        (["x:coil:50:-10:3"], "radius and turns are above 0"),
+        (["x:coil:inf:10:3"], "radius and turns are above 0"),
+        (["x:coil:50:10:3"], "1 given; a rotating field needs three coils or more"),
+        (["x:coil:50:10:3", "x:coil:50:10:3", "z:coil:50:10:3"], "no currents make a field along y"),
+    ],
+)
+def test_windings_that_are_none_are_refused_in_one_line(texts, says):
+    with pytest.raises(UsageError, match=says) as refused:
+        windings_matrix(texts)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("words", [[], ["coils.csv", "--winding", "x:coil:1:1:1"]])
+def test_calibrate_coils_takes_a_table_or_windings_and_not_both(words):
+    told = CliRunner().invoke(app, ["calibrate", "coils", *words]).exception
+    assert isinstance(told, UsageError) and "give a table of measured fields, or --winding" in str(told)

@@ -8,12 +8,13 @@ import pytest
 
 from flowrec.core.errors import MovieError, UsageError
 from flowrec.stages.control import Coils
-from flowrec.stages.control.coil_log import read_coil_log
+from flowrec.stages.control.coil_log import current_columns, read_coil_log
 from flowrec.stages.control.field_log import FieldLog
 from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.stages.rig_settings import Columns
 
 MT_PER_A = ((2.1, 0.1, 0.0), (0.0, 1.9, -0.2), (0.05, 0.0, 1.5))
+FIVE = ((1.3, 0.8, 0.1, -0.1, 0.05), (0.1, -0.05, 0.9, 1.1, 0.0), (0.0, 0.1, -0.05, 0.05, 1.0))
 # frequency, heading in degrees: with reversals, small turns and a rest
 COMMANDS = [(12.0, 20.0), (12.0, 35.0), (3.0, -150.0), (0.0, -150.0), (20.0, 100.0), (8.0, 170.0)]
 LASTS_S, SAMPLES_HZ = 0.25, 500.0
@@ -41,18 +42,18 @@ def motion(coils):
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"surface": "ceiling"}, {"mode": "helix"}, {"mode": "helix", "handedness": "left"}],
-    ids=["floor", "ceiling", "right", "left"],
+    [{}, {"surface": "ceiling"}, {"mode": "helix"}, {"mode": "helix", "handedness": "left"}, {"mt_per_a": FIVE}],
+    ids=["floor", "ceiling", "right", "left", "five coils"],
 )
 def test_sampled_fields_and_currents_tell_the_turns_of_the_robot(settings, tmp_path):
-    coils = Coils(mt_per_a=MT_PER_A, bias_mt=(0.02, -0.03, 0.01), **settings)
+    coils = Coils(**{"mt_per_a": MT_PER_A, "bias_mt": (0.02, -0.03, 0.01)} | settings)
     exact, times, field = motion(coils)
-    currents = (field - np.array(coils.bias_mt)) @ np.linalg.inv(np.array(MT_PER_A)).T
+    currents = (field - np.array(coils.bias_mt)) @ np.linalg.pinv(np.array(coils.mt_per_a)).T
     logs = [
         read_coil_log(write(tmp_path / f"{header[1]}.csv", header, np.column_stack([times, values])), Columns(), coils)
         for header, values in (
             (["time_s", "b_x_mt", "b_y_mt", "b_z_mt"], field),
-            (["time_s", "i_x_a", "i_y_a", "i_z_a"], currents),
+            (["time_s", *current_columns(coils.count)], currents),
         )
     ]
     np.testing.assert_allclose(logs[1].currents_a, currents)

@@ -3,9 +3,11 @@ from itertools import groupby
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from flowrec.core.errors import UsageError
 from flowrec.core.messages import Currents, Demand
+from flowrec.core.summary import verdict_lines
 from flowrec.physics.chip.io import load_chip
 from flowrec.physics.robot import Robot
 from flowrec.stages.config import load_config
@@ -167,6 +169,97 @@ def test_a_current_amplifier_is_told_volts_in_proportion_to_the_current_and_kept
         np.testing.assert_allclose(c.voltages_v, c.currents_a / np.array([0.5, 0.4, 0.25]), atol=1e-12)
     assert said[-1].amplitude_mt == pytest.approx(8.0 * 0.25 * 1.5)
     assert np.abs([c.voltages_v for c in said]).max() <= 8.0 + 1e-12
+
+
+def in_all_directions(count=300):
+    k = np.arange(count) + 0.5
+    z, azimuth = 1.0 - k / (0.5 * count), math.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z**2)
+    return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+
+
+def drawn_coils(seed, count, **more):
+    """Coils that point anywhere, and that differ by up to three times."""
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(3, count)) * rng.uniform(0.5, 1.5, count)
+    return Coils(mt_per_a=tuple(map(tuple, matrix.tolist())), bias_mt=BIAS, **more)
+
+
+@pytest.mark.parametrize("count", [4, 6, 8])
+def test_of_more_than_three_coils_those_currents_are_taken_whose_sum_of_squares_is_least(count):
+    coils = drawn_coils(1, count, max_current_a=50.0, amplifier=AmplifierSettings(a_per_v=10.0))
+    field = 4.0 * in_all_directions()
+    least = np.linalg.lstsq(np.array(coils.mt_per_a), (field - BIAS).T)[0].T
+    np.testing.assert_allclose(coils.currents_a(field, np.full(len(field), 4.0)), least, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("count", [4, 6, 8])
+def test_where_a_coil_would_exceed_its_limit_the_others_take_over_within_theirs(count, seed):
+    """The best of all is a linear program for each direction: the longest field there that bounded currents make."""
+    coils = drawn_coils(seed, count, amplitude_mt=4.0, max_current_a=1.0)
+    matrix, directions = np.array(coils.mt_per_a), in_all_directions()
+    full_mt = coils.full_mt(ROBOT)
+    currents = coils.currents_a(full_mt * directions, np.full(len(directions), full_mt))
+    assert np.abs(currents).max() <= 1.0 + 1e-9
+    np.testing.assert_allclose(currents @ matrix.T + BIAS, full_mt * directions, atol=1e-12)
+    least_norm = np.linalg.pinv(matrix)
+    rows, bias_a = np.linalg.norm(least_norm, axis=1), np.abs(least_norm @ BIAS)
+    assert full_mt >= min(((1.0 - bias_a) / rows).min(), 4.0) - 1e-9, "never less than with the pseudo-inverse"
+    longest = [0.0] * count + [-1.0]
+    bounds = [(-1.0, 1.0)] * count + [(0.0, 4.0)]
+    best_mt = min(
+        linprog(longest, A_eq=np.column_stack([matrix, -d]), b_eq=-np.array(BIAS), bounds=bounds).x[-1]
+        for d in directions[::10]
+    )
+    assert full_mt >= 0.85 * best_mt
+
+
+def test_a_field_of_six_coils_turns_as_that_of_three_and_what_is_missing_of_it_is_stated():
+    coils = drawn_coils(3, 6, max_current_a=0.8, ramp_s=0.1)
+    plan = [((120.0, 90.0), 0.5), ((-300.0, 50.0), 0.2)]
+    said = turn(coils, plan)
+    three = turn(Coils(ramp_s=0.1, amplitude_mt=4.0), plan)
+    assert {c.unmet_mt for c in three} == {0.0}
+    full_mt = coils.full_mt(ROBOT)
+    assert 1.0 < full_mt < 4.0 and {c.unmet_mt for c in said} == {4.0 - full_mt}
+    assert all(c.currents_a.shape == c.voltages_v.shape == (6,) for c in said)
+    assert np.abs([c.currents_a for c in said]).max() <= 0.8 + 1e-9
+    np.testing.assert_allclose(np.linalg.norm(field_mt(coils, said[200:]), axis=1), full_mt, rtol=1e-9)
+    steady = said[200:480]
+    assert [c.phase_rad for c in steady[:1]] != [0.0] and np.ptp([c.frequency_hz for c in steady]) == 0.0
+    assert said[300].heading_rad == three[300].heading_rad
+
+
+def test_a_mission_with_six_coils_says_once_what_the_coils_could_not_do():
+    assert "weaker" not in " ".join(verdict_lines({"outcome": "reached"}))
+    lines = verdict_lines({"outcome": "reached", "unmet_mt": 0.8})
+    assert lines[1] == "The field was 0.8 mT weaker than asked for: a limit of the coils"
+
+
+@pytest.mark.parametrize(
+    ("sets", "says"),
+    [
+        (["coils.mt_per_a=[[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]"], "rows of 2, 2, 2 numbers; give three rows"),
+        (["coils.mt_per_a=[[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]"], "rows of 4, 3, 3 numbers"),
+        (
+            ["coils.mt_per_a=[[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]]", "coils.amplifier.a_per_v=[1.0, 1.0, 1.0]"],
+            "a_per_v: 3 numbers, where coils.mt_per_a has 4 columns; give one number for all coils, or one for each",
+        ),
+        (["coils.mt_per_a=[[1, 0, 1, 1], [0, 1, 1, 1], [0, 0, 0, 0]]"], "no currents make a field along z"),
+        (
+            [
+                "coils.mt_per_a=[[1, 0, 0, 0.001], [0, 1, 0, 0], [0, 0, 1, 0]]",
+                "coils.bias_mt=[0, 6, 0]",
+            ],
+            r"coil 2 needs all of it against coils\.bias_mt",
+        ),
+    ],
+)
+def test_matrices_that_are_none_are_refused_in_one_line(sets, says):
+    with pytest.raises(UsageError, match=rf"--set: coils\..*{says}") as caught:
+        load_config(None, sets)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

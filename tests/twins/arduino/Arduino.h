@@ -9,6 +9,7 @@ uint32_t micros();
 void pinMode(int pin, int mode);
 void digitalWrite(int pin, int level);
 void analogWrite(int pin, int value);
+int analogRead(int pin);
 
 struct SerialPort {
   void begin(long baud);

@@ -31,6 +31,8 @@ class AmplifierInfo:
     max_output_hz : highest rate of its output samples.
     latency_s : from `apply` to the output, as configured; the field log holds what was measured.
     timer_s : silence after which the device itself goes to zero; 0: it holds its last output for ever.
+    measures : it measures the currents, and has a method `measured() -> Measured | None`: the latest measurement, with
+        its stamp on the host's monotonic clock; None: there is none yet.
     """
 
     model: str
@@ -40,10 +42,11 @@ class AmplifierInfo:
     max_output_hz: float
     latency_s: float
     timer_s: float
+    measures: bool = False
 
 
 class Amplifier(Protocol):
-    """Three coil amplifiers behind one device. No method but `open`, `zero` and `close` blocks."""
+    """The amplifiers of all coils behind one device. No method but `open`, `zero` and `close` blocks."""
 
     def open(self) -> AmplifierInfo:
         """Find the device and take its outputs to zero. It stays disarmed: no command makes a field.

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Currents, RigError, UsageError, seconds, wrap_rad
+from flowrec.core import Currents, Measured, RigError, UsageError, coil_names, seconds, wrap_rad
 from flowrec.physics import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.stages import Coils, FieldCommand, OutputLimits, field_limits
@@ -42,7 +42,7 @@ class CommandLimits:
     ) -> None:
         self.coils, self.output, self.tell = coils, output, tell
         self.amplitude_mt = coils.full_mt(robot)
-        self.rotation_hz = coils.fastest_um_s(robot) / robot.um_per_rev
+        self.rotation_hz = coils.fastest_hz(robot)
         self.on_left_s = output.longest_on_s
         self._resting = False
         self._last: tuple[int, bool] | None = None  # time of the last command; with a field?
@@ -93,6 +93,11 @@ class CommandLimits:
                 raise UsageError(
                     f"{key} = {asked:g} {unit}: {info.model} makes at most {offered:g} {unit}; set it to that or less"
                 )
+        if self.output.measured_within_a is not None and not info.measures:
+            raise UsageError(
+                f"lab.output.measured_within_a = {self.output.measured_within_a:g}: {info.model} measures no currents; "
+                "leave it out"
+            )
 
     def admit(self, currents: Currents, now_ns: int) -> FieldCommand:
         """The command that the amplifier gets; within all limits, and finite, whatever it is given.
@@ -133,8 +138,8 @@ class CommandLimits:
 
         Parameters
         ----------
-        currents_a : (n + 1, 3), the first one that of the sample before.
-        voltages_v : (n, 3)
+        currents_a : (n + 1, coils), the first one that of the sample before.
+        voltages_v : (n, coils)
 
         Raises
         ------
@@ -148,7 +153,7 @@ class CommandLimits:
 
     @property
     def _turning_a_s(self) -> NDArray[np.float64]:
-        """(3,) largest rate of change of the currents while the amplitude is constant."""
+        """(coils,) largest rate of change of the currents while the amplitude is constant."""
         turning: NDArray[np.float64] = (
             field_limits(self.coils).row_a_per_mt * self.amplitude_mt * _TURN_RAD * self.rotation_hz
         )
@@ -174,6 +179,38 @@ class CommandLimits:
         if cause not in self._told:
             self._told.add(cause)
             self.tell(text)
+
+
+class ReadBack:
+    """Compares measured currents with those that were put out.
+
+    Parameters
+    ----------
+    within_a, after_s : see OutputLimits; within_a None: nothing is compared.
+    """
+
+    def __init__(self, within_a: float | None, after_s: float) -> None:
+        self._within_a, self._after_s = within_a, after_s
+        self._since_ns: int | None = None
+
+    def fault(self, measured: Measured | None) -> str:
+        """Sentence on a difference that has lasted too long, by this measurement and those before; '' without one."""
+        if self._within_a is None or measured is None:
+            return ""
+        difference_a = np.abs(measured.currents_a - measured.put_out_a)
+        if (difference_a <= self._within_a).all():  # false for NaN
+            self._since_ns = None
+            return ""
+        self._since_ns = measured.stamp_ns if self._since_ns is None else self._since_ns
+        lasts_s = seconds(measured.stamp_ns - self._since_ns)
+        if lasts_s < self._after_s:
+            return ""
+        coil = int(np.argmax(difference_a))
+        return (
+            f"coil {coil_names(len(difference_a))[coil]} has {measured.currents_a[coil]:.3g} A where "
+            f"{measured.put_out_a[coil]:.3g} A are put out, for {1e3 * lasts_s:.0f} ms (lab.output.measured_within_a = "
+            f"{self._within_a:g}): see to the coil, its amplifier and its sensor"
+        )
 
 
 def _refuse_beyond(name: str, values: NDArray[np.float64], limit: float, unit: str) -> None:

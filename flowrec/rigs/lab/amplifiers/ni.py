@@ -1,4 +1,4 @@
-"""Amplifier `ni`: three analog outputs of an NI device, kept in samples by a process of their own (ni_process.py)."""
+"""Amplifier `ni`: analog outputs of an NI device, one a coil, which a process keeps in samples (ni_process.py)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Played:
     from_ns: int
     segments: tuple[MotionSegment, ...]
     amplitude_mt: float
-    currents_a: NDArray[np.float64]  # (3,) at the first sample
+    currents_a: NDArray[np.float64]  # (n,) at the first sample
 
 
 class NiAmplifier:
@@ -76,7 +76,7 @@ class NiAmplifier:
         self._played_s = 0.0
         self._played: deque[Played] = deque()  # blocks whose time has not come
         self._cuts: deque[int] = deque()  # when zero() took the output to zero; any thread appends
-        self._log = FieldLog()
+        self._log = FieldLog(coils=settings.coils.count)
 
     def open(self) -> AmplifierInfo:
         self._fault = ""
@@ -136,7 +136,7 @@ class NiAmplifier:
             cut_ns = self._cuts.popleft()
             self._log_played(cut_ns)
             self._played.clear()
-            self._log.append(not_before(self._log, cut_ns), 0.0, 0.0, 0.0, np.zeros(3))
+            self._log.append(not_before(self._log, cut_ns), 0.0, 0.0, 0.0)
         self._log_played(until_ns + 1)
         self._log.forget(until_ns - round(KEEP_S * NS_PER_S))
         return self._log

@@ -1,4 +1,4 @@
-"""Three analog outputs of an NI device, through NI-DAQmx of this computer or an NI gRPC Device Server."""
+"""Analog outputs of an NI device, one a coil, through NI-DAQmx of this computer or an NI gRPC Device Server."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from nidaqmx.errors import DaqError, DaqNotFoundError, DaqNotSupportedError, Rpc
 from nidaqmx.system import Device
 from numpy.typing import NDArray
 
-from flowrec.core import RigError
+from flowrec.core import RigError, coil_names
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.stages import AmplifierSettings
 
-_COILS = 3  # x, y and z, a channel each
 _CONNECT_S = 10.0
 UNDERFLOWS = (-200290, -200621, -200018, -200016)  # of the buffer in the computer, and of those in devices
 # Codes of NI-DAQmx (NIDAQmx.h).
@@ -33,17 +32,21 @@ class NiDevice:
     channels : as NI-DAQmx names them: 'cDAQ1Mod1/ao0:2'.
     server : host:port of a gRPC server; '': the local driver.
     amplifier : range and rate of the outputs.
+    coils : their number.
     latency_s : that is stated in `info`.
 
     Raises
     ------
-    RigError : no driver, server or device, or not three outputs; one line.
+    RigError : no driver, server or device, or not one output a coil; one line.
     """
 
-    def __init__(self, channels: str, server: str, amplifier: AmplifierSettings, latency_s: float) -> None:
-        self._channels, self._amplifier = channels, amplifier
+    def __init__(self, channels: str, server: str, amplifier: AmplifierSettings, coils: int, latency_s: float) -> None:
+        self._channels, self._amplifier, self._coils = channels, amplifier, coils
         if not channels:
-            raise RigError("lab.ni.channels: which outputs drive the coils x, y, z? For instance 'cDAQ1Mod1/ao0:2'")
+            names = ", ".join(coil_names(coils))
+            raise RigError(
+                f"lab.ni.channels: which outputs drive the coils {names}? For instance 'cDAQ1Mod1/ao0:{coils - 1}'"
+            )
         self._options = grpc_options(server) if server else None
         self._task: nidaqmx.Task | None = None
         try:
@@ -87,7 +90,7 @@ class NiDevice:
         return (before_ns + time.monotonic_ns()) // 2
 
     def write(self, voltages_v: NDArray[np.float64]) -> None:
-        """Append samples (n, 3)."""
+        """Append samples (n, coils)."""
         assert self._task is not None
         self._task.write(np.ascontiguousarray(voltages_v.T), auto_start=False)
 
@@ -125,11 +128,12 @@ class NiDevice:
         # Within what the device offers: what is asked for beyond it is refused later, with the name of the setting.
         with self._new_task(min(self._amplifier.max_voltage_v, offered_v)) as task:
             names = task.ao_channels.channel_names
-        if len(names) != _COILS:
+        if len(names) != self._coils:
             raise RigError(
-                f"lab.ni.channels = {self._channels!r}: {len(names)} outputs, where three coils need {_COILS}"
+                f"lab.ni.channels = {self._channels!r}: {len(names)} outputs, where the coils of coils.mt_per_a need "
+                f"{self._coils}"
             )
-        if len(set(names)) != _COILS:
+        if len(set(names)) != self._coils:
             raise RigError(
                 f"lab.ni.channels = {self._channels!r}: an output is named twice; each coil needs one of its own"
             )

@@ -137,7 +137,8 @@ class Server:
 
     def _open(self, settings: NiSettings) -> None:
         self._settings = settings
-        device = NiDevice(settings.channels, settings.server, settings.coils.amplifier, LATENCY_S)
+        coils = settings.coils
+        device = NiDevice(settings.channels, settings.server, coils.amplifier, coils.count, LATENCY_S)
         device.take()
         self._device = device  # from now on its outputs are taken to zero at the end, whoever uses them
         prioritise_process(Priority.DEVICE)  # now that the driver has started its threads

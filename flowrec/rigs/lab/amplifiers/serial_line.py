@@ -17,10 +17,21 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
 import serial
 from serial.tools import list_ports
 
-from flowrec.core import NS_PER_S, DeviceClock, Fit, Priority, RigError, UsageError, realtime_priority, seconds
+from flowrec.core import (
+    NS_PER_S,
+    DeviceClock,
+    Fit,
+    Measured,
+    Priority,
+    RigError,
+    UsageError,
+    realtime_priority,
+    seconds,
+)
 from flowrec.rigs.lab.amplifiers.amplifier import KEEP_S, AmplifierInfo, not_before
 from flowrec.rigs.lab.amplifiers.serial_protocol import (
     VERSION,
@@ -45,6 +56,7 @@ _SILENT_S = 0.4  # a board that answers no command for so long does not answer
 _LEAST_S = 0.008  # between two lines: a line and its answer take that long at 115200 baud
 _TURNS = 1e-6  # the controller counts millionths of a revolution
 _WRAP = 1 << 32  # its counters have 32 bits
+_COILS = 3  # of a firmware that does not state their number
 
 
 class SerialAmplifier:
@@ -84,8 +96,10 @@ class SerialAmplifier:
         self._heard_s = 0.0
         self._zeros = 0  # confirmations of Z
         self._answered = threading.Condition()
+        self._read_back: Measured | None = None
         # The log, for the loop's thread only.
-        self._log = FieldLog()
+        self._log = FieldLog(coils=coils.count)
+        self._no_field = Telemetry(0, 0.0, 0.0, 0.0, (0, 0), np.zeros(coils.count))
         self._clock = DeviceClock(unit=1000.0, wrap=_WRAP)
         self._fit: Fit | None = None
         self._round_trip_ns = math.inf
@@ -146,6 +160,10 @@ class SerialAmplifier:
         self._log.forget(until_ns - round(KEEP_S * NS_PER_S))
         return self._log
 
+    def measured(self) -> Measured | None:
+        """The latest measurement, at the arrival of its answer."""
+        return self._read_back
+
     def zero(self) -> None:
         self._permitted = self._on = False
         if self._port is None:
@@ -159,7 +177,7 @@ class SerialAmplifier:
                 raise RigError(f"{self._name}: the amplifier can not be reached ({error})") from error
             with self._answered:
                 if self._answered.wait_for(lambda seen=before: self._zeros > seen, _CONFIRM_S):  # type: ignore[misc]
-                    self._measured.append((_NO_FIELD, time.monotonic_ns(), 0))
+                    self._measured.append((self._no_field, time.monotonic_ns(), 0))
                     return
         raise RigError(f"{self._name}: the amplifier does not confirm that it is at zero")
 
@@ -211,23 +229,31 @@ class SerialAmplifier:
                 f"{self._name}: no answer in {_BOOT_S:g} s; is the firmware on the board, lab.serial.baud right?"
             )
         try:
-            model, version, most_ua, timer_ms, update_hz = answer.words
-            found = int(version), int(most_ua), int(timer_ms), int(update_hz)
+            model, *numbers = answer.words
+            version, most_ua, timer_ms, _update_hz, coils, sensors = map(
+                int, (numbers + [str(_COILS), "0"][len(numbers) - 4 :])
+            )
         except ValueError as error:
             raise RigError(
                 f"{self._name}: another device than flowrec-coils answers (by {_words(answer)!r}); is lab.serial.port "
                 "right?"
             ) from error
-        if found[0] != VERSION:
-            raise RigError(f"{self._name}: protocol {found[0]}, where {VERSION} is needed; put the new firmware on it")
+        if version != VERSION:
+            raise RigError(f"{self._name}: protocol {version}, where {VERSION} is needed; put the new firmware on it")
+        if coils != self._coils.count:
+            raise UsageError(
+                f"{self._name}: the firmware drives {coils} coils, where coils.mt_per_a has {self._coils.count} "
+                "columns; give that one column a coil, or the sketch the pins of all coils (PWM_PINS, DIR_PINS)"
+            )
         return AmplifierInfo(
             model=model,
             serial="",
-            max_current_a=1e-6 * found[1],
+            max_current_a=1e-6 * most_ua,
             max_voltage_v=math.inf,
             max_output_hz=math.inf,
             latency_s=0.01,
-            timer_s=1e-3 * found[2],
+            timer_s=1e-3 * timer_ms,
+            measures=sensors == coils,
         )
 
     def _ask(self, verb: str, *numbers: int, timeout_s: float = _CONFIRM_S) -> Reply | None:
@@ -296,10 +322,12 @@ class SerialAmplifier:
 
     def _hear(self, answer: Reply, arrival_ns: int) -> None:
         self._heard_s = seconds(arrival_ns)
-        measured = telemetry(answer)
+        measured = telemetry(answer, self._coils.count)
         sent_ns, field = self._sent.pop(answer.number, (0, False))
         if measured is not None and sent_ns:
             self._measured.append((measured, sent_ns, arrival_ns))
+            if measured.measured_a is not None:
+                self._read_back = Measured(arrival_ns, measured.measured_a, measured.currents_a)
             return
         if answer.verb == "E" and field:
             why = "no line reached it in time" if "timer" in answer.words else _words(answer)
@@ -313,7 +341,7 @@ class SerialAmplifier:
 
     def _take(self, now: Telemetry, sent_ns: int, arrival_ns: int) -> None:
         """Add an answer to the log, and the mean of the time between the last answer and this one."""
-        if now is _NO_FIELD:
+        if now is self._no_field:
             self._append(sent_ns, now)
             self._before = None
             return
@@ -337,9 +365,6 @@ class SerialAmplifier:
         self._log.append(
             not_before(self._log, stamp_ns), now.frequency_hz, now.heading_rad, now.amplitude_mt, now.currents_a
         )
-
-
-_NO_FIELD = Telemetry(0, 0.0, 0.0, 0.0, (0, 0), FieldLog().at(0).currents_a)
 
 
 def _signed_difference(difference: int) -> int:

@@ -41,7 +41,8 @@ class Telemetry:
     heading_rad: float  # direction in which the robot travels
     amplitude_mt: float
     turns: tuple[int, int]  # 1e-6 revolutions along x and y since the board started; wrap at 2^32
-    currents_a: NDArray[np.float64]  # (3,)
+    currents_a: NDArray[np.float64]  # (coils,)
+    measured_a: NDArray[np.float64] | None = None  # (coils,), by a board with sensors
 
 
 def line(verb: str, number: int, *numbers: int) -> bytes:
@@ -60,18 +61,20 @@ def reply(received: bytes) -> Reply | None:
     return Reply(verb, number, tuple(words[1:]))
 
 
-def telemetry(answer: Reply) -> Telemetry | None:
-    """The telemetry in a reply; None: it has none."""
+def telemetry(answer: Reply, coils: int) -> Telemetry | None:
+    """The telemetry of so many coils in a reply; None: it has none."""
     if answer.verb != "F":
         return None
     try:
         clock, mhz, heading, ut, _phase, _plane, x, y, *currents = (int(word) for word in answer.words)
     except ValueError:
         return None
-    if len(currents) != 3:
+    if len(currents) not in (coils, 2 * coils):
         return None
     heading_rad = heading / _MILLION * _TURN_RAD
-    return Telemetry(clock, 1e-3 * mhz, heading_rad, 1e-3 * ut, (x, y), np.array(currents) / _MILLION)
+    put_out_a = np.array(currents[:coils]) / _MILLION
+    measured_a = np.array(currents[coils:]) / _MILLION if len(currents) == 2 * coils else None
+    return Telemetry(clock, 1e-3 * mhz, heading_rad, 1e-3 * ut, (x, y), put_out_a, measured_a)
 
 
 def field_line(number: int, command: FieldCommand) -> bytes:

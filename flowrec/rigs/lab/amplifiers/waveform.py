@@ -17,8 +17,8 @@ class Block:
 
     Attributes
     ----------
-    currents_a : (n + 1, 3) at the samples, and at the first one of the next block.
-    voltages_v : (n, 3) held from sample to sample.
+    currents_a : (n + 1, coils) at the samples, and at the first one of the next block.
+    voltages_v : (n, coils) held from sample to sample.
     segments : how the robot travels meanwhile; amplitude_mt : of the field in the middle.
     """
 

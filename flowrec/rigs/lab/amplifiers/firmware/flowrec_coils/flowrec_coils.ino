@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// flowrec_coils: three coils on a microcontroller that generates the rotating field itself.
+// flowrec_coils: coils on a microcontroller that generates the rotating field itself.
 //
 // The recorder sends what the field does (frequency, heading, amplitude), not currents: the phase is kept here, so it is
 // continuous whatever the recorder and the cable do, and the turns of the field are counted where they are made.
@@ -30,12 +30,37 @@
 #define PWM_FULL 255     // analogWrite of the full scale
 #endif
 
-// One H-bridge for each coil x, y, z, controlled by a PWM and a direction pin. The full scale makes MAX_UA.
-static const int PWM_PIN[3] = {2, 3, 4};
-static const int DIR_PIN[3] = {5, 6, 7};
+// One H-bridge for each coil, controlled by a PWM and a direction pin. The full scale makes MAX_UA. Of three coils the
+// order is x, y, z, else that of the columns of coils.mt_per_a. There are as many coils as pins; up to 12.
+#ifndef PWM_PINS
+#define PWM_PINS 2, 3, 4
+#define DIR_PINS 5, 6, 7
+#endif
+static const int PWM_PIN[] = {PWM_PINS};
+static const int DIR_PIN[] = {DIR_PINS};
+static const int COILS = sizeof PWM_PIN / sizeof PWM_PIN[0];
+static_assert(sizeof DIR_PIN == sizeof PWM_PIN, "each coil needs a PWM pin and a direction pin");
+static_assert(COILS >= 3 && COILS <= 12, "a rotating field needs three coils; a line has room for twelve");
+
+// Sensors of the currents, where the board has them: a pin for each coil, the count of analogRead without a current, and
+// microamperes a count. Without SENSE_PINS nothing is measured.
+// #define SENSE_PINS A0, A1, A2
+#ifdef SENSE_PINS
+#ifndef SENSE_ZERO
+#define SENSE_ZERO 2048
+#define SENSE_UA 2500L
+#endif
+static const int SENSE_PIN[] = {SENSE_PINS};
+static const int SENSORS = COILS;
+static_assert(sizeof SENSE_PIN == sizeof PWM_PIN, "each coil needs a sensor, or none has one");
+static int32_t measured_ua(int c) { return (int32_t)(analogRead(SENSE_PIN[c]) - SENSE_ZERO) * SENSE_UA; }
+#else
+static const int SENSORS = 0;
+static int32_t measured_ua(int) { return 0; }
+#endif
 
 static void begin_outputs() {
-  for (int c = 0; c < 3; c++) {
+  for (int c = 0; c < COILS; c++) {
     pinMode(PWM_PIN[c], OUTPUT);
     pinMode(DIR_PIN[c], OUTPUT);
     analogWrite(PWM_PIN[c], 0);
@@ -58,7 +83,7 @@ static char why_off = 'B';    // B: after the start, Z: by a Z line, T: by the t
 static uint32_t heard_ms = 0;  // when the last valid line came
 static int32_t last_seq = -1;
 
-static float vector_ua[4][3];       // per mT: vertical, horizontal along 0 and 90 degrees; and the bias, uA
+static float vector_ua[4][COILS];       // per mT: vertical, horizontal along 0 and 90 degrees; and the bias, uA
 static float limit_ua = 0.0f;       // of each coil
 static float fade_ut = 0.0f;        // below this amplitude the compensation of the bias is reduced in proportion
 static uint8_t configured = 0;      // bits 0 to 3: vectors, 4: limits
@@ -69,7 +94,7 @@ static float amplitude_ut = 0.0f, target_ut = 0.0f, ramp_ut_s = 0.0f;
 static float frequency_hz = 0.0f, slew_hz = 0.0f;  // slew_hz: of the plane, sqrt(limit^2 - f^2)
 static int8_t direction = 1;
 static int64_t turns_x = 0, turns_y = 0;  // in 1e-12 revolutions
-static float current_ua[3] = {0.0f, 0.0f, 0.0f};
+static float current_ua[COILS];
 static uint32_t updated_us = 0;
 
 static float radians_of(uint32_t angle) { return (float)(int32_t)angle * (float)(2.0 * M_PI / 4294967296.0); }
@@ -77,14 +102,14 @@ static float radians_of(uint32_t angle) { return (float)(int32_t)angle * (float)
 // ---- Output
 
 static void put_out(const float *microamperes) {
-  for (int c = 0; c < 3; c++) {
+  for (int c = 0; c < COILS; c++) {
     current_ua[c] = microamperes[c];
     write_coil(c, microamperes[c]);
   }
 }
 
 static void zero(char why) {
-  static const float none[3] = {0.0f, 0.0f, 0.0f};
+  static const float none[COILS] = {0.0f};
   armed = false;
   why_off = why;
   amplitude_ut = target_ut = frequency_hz = slew_hz = 0.0f;
@@ -133,26 +158,26 @@ static void update() {
   const float up = cosf(radians_of(phase)), across = sinf(radians_of(phase));
   const float along = across * cosf(radians_of(plane)), beside = across * sinf(radians_of(plane));
   const float weight = amplitude_ut < fade_ut ? amplitude_ut / fade_ut : 1.0f;
-  float wanted[3], largest = 0.0f;
-  for (int c = 0; c < 3; c++) {
+  float wanted[COILS], largest = 0.0f;
+  for (int c = 0; c < COILS; c++) {
     const float per_mt = up * vector_ua[0][c] + along * vector_ua[1][c] + beside * vector_ua[2][c];
     wanted[c] = 1e-3f * amplitude_ut * per_mt - weight * vector_ua[3][c];
     if (fabsf(wanted[c]) > largest) largest = fabsf(wanted[c]);
   }
   if (!(largest <= limit_ua)) {  // also for a number that is none
     const float less = largest > 0.0f && isfinite(largest) ? limit_ua / largest : 0.0f;
-    for (int c = 0; c < 3; c++) wanted[c] = less > 0.0f ? wanted[c] * less : 0.0f;
+    for (int c = 0; c < COILS; c++) wanted[c] = less > 0.0f ? wanted[c] * less : 0.0f;
   }
   put_out(wanted);
 }
 
 // ---- Lines
 
-static char line[128];
+static char line[64 + 12 * COILS];
 static uint8_t length = 0;
 static bool overlong = false;
-static char reply[160];
-static char waiting[480];  // replies that are not sent yet
+static char reply[124 + 24 * COILS];
+static char waiting[3 * sizeof reply];  // replies that are not sent yet
 static size_t waiting_count = 0;
 
 static uint16_t crc16(const char *text, size_t count) {  // CCITT-FALSE: polynomial 0x1021, begins with 0xffff
@@ -250,7 +275,8 @@ static void telemetry(int32_t seq) {
   add_number(millionths(plane));
   add_number((int32_t)(uint32_t)(turns_x / 1000000LL));
   add_number((int32_t)(uint32_t)(turns_y / 1000000LL));
-  for (int c = 0; c < 3; c++) add_number((int32_t)current_ua[c]);
+  for (int c = 0; c < COILS; c++) add_number((int32_t)current_ua[c]);
+  for (int c = 0; c < SENSORS; c++) add_number(measured_ua(c));
   send();
 }
 
@@ -263,9 +289,11 @@ static void obey(char verb, int32_t seq, const int32_t *given, int count) {
     add_number(MAX_UA);
     add_number(TIMER_MS);
     add_number(1000000L / (long)UPDATE_US);
+    if (COILS != 3 || SENSORS) add_number(COILS);
+    if (SENSORS) add_number(SENSORS);
     send();
-  } else if (verb == 'V' && count == 4 && given[0] >= 0 && given[0] < 4 && !armed) {
-    for (int c = 0; c < 3; c++) vector_ua[given[0]][c] = (float)given[c + 1];
+  } else if (verb == 'V' && count == COILS + 1 && given[0] >= 0 && given[0] < 4 && !armed) {
+    for (int c = 0; c < COILS; c++) vector_ua[given[0]][c] = (float)given[c + 1];
     configured |= (uint8_t)(1 << given[0]);
     begin_reply('V');
     add_number(seq);
@@ -324,10 +352,11 @@ static void take_line() {
     return;
   }
   line[length - 5] = 0;
-  int32_t given[6];
+  static const int MOST = COILS + 2 > 6 ? COILS + 2 : 6;  // numbers of a line
+  int32_t given[MOST];
   int count = 0;
   char *rest = line + 1, *end = rest;
-  for (; count < 6; count++, rest = end) {
+  for (; count < MOST; count++, rest = end) {
     const long value = strtol(rest, &end, 10);
     if (end == rest) break;
     given[count] = (int32_t)value;
