@@ -26,11 +26,14 @@ class LocalFile:
     ----------
     path : its name, for messages.
     size : number of bytes when it was opened.
+    is_far : a request for each range takes a round trip, so ranges next to each other are worth an effort.
 
     Raises
     ------
     SessionError : it can not be opened.
     """
+
+    is_far = False
 
     def __init__(self, path: Path) -> None:
         self.path = path

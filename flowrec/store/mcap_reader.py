@@ -32,6 +32,7 @@ from mcap.records import (
 
 from flowrec.core import MOVIE_FILES, SessionError
 from flowrec.store.byte_source import open_bytes
+from flowrec.store.gathered_copies import GatheredCopies, complement
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
     CHUNK_HEAD,
@@ -56,6 +57,7 @@ _FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
 _AT_ONCE_BYTES, _WINDOW_LIMIT_BYTES = 8 << 20, 8 << 20
 _HEADER_LIMIT_BYTES = 1 << 16
 _SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
+_COPIES_GAP_BYTES = 1 << 20  # between copies is what belongs to them
 _SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
 _PARSED: dict[Opcode, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 _LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: 256 << 20}
@@ -116,7 +118,11 @@ class McapReader:
         self.start_unix_ns = 0
         self._bytes = open_bytes(path)
         self.size, self.close = self._bytes.size, self._bytes.close
+        self._summary: Summary | None = None  # that was read to find the copies
+        self._copies: GatheredCopies | None = None
         try:
+            if self._bytes.is_far:
+                self._find_copies()
             self.header = self._read_header()
         except BaseException:
             self.close()
@@ -137,18 +143,41 @@ class McapReader:
         """Exactly that many bytes."""
         if not 0 <= offset <= offset + length <= self.size:
             raise self.damage_error(offset, f"{length} bytes are announced, the file ends at {self.size}")
-        data = self._bytes.read(offset, length)
+        copy = self._copies.place_of(offset, length) if self._copies is not None else None
+        data = self._bytes.read(offset if copy is None else copy, length)
         if len(data) < length:
             raise self.damage_error(offset, "the file has become shorter while it was read")
-        return data
+        return data if copy is None else complement(data)
+
+    def read_originals(self) -> None:
+        """Read every record where it stands from now on, none from its copy."""
+        self._copies = None
 
     def prefetch(self, chunks: Iterable[ChunkIndex], *, indexes: bool = False) -> None:
         """Announce that these chunks, or the indexes after them, will be read soon: one round trip for a URL."""
+        if not self._bytes.is_far:
+            return
         ends = ((chunk, chunk.chunk_start_offset + chunk.chunk_length) for chunk in chunks)
         if indexes:
-            self._bytes.prefetch([(end, chunk.message_index_length) for chunk, end in ends])
+            wanted = [(end, chunk.message_index_length) for chunk, end in ends]
         else:
-            self._bytes.prefetch([(chunk.chunk_start_offset, chunk.chunk_length) for chunk, _ in ends])
+            wanted = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk, _ in ends]
+        copies: list[tuple[int, int]] = []
+        elsewhere: list[tuple[int, int]] = []
+        for offset, length in wanted:
+            copy = self._copies.place_of(offset, length) if self._copies is not None else None
+            if copy is None:
+                elsewhere.append((offset, length))
+            else:
+                copies.append((copy, length))
+        self._bytes.prefetch(copies, _COPIES_GAP_BYTES)
+        self._bytes.prefetch(elsewhere)
+
+    def _find_copies(self) -> None:
+        """Find the copies of a file at a URL by its index."""
+        with contextlib.suppress(DamageError, UnfinishedError):  # raised again where the index is wanted
+            self._summary = self.read_summary()
+            self._copies = GatheredCopies(self._summary)
 
     def damage_error(self, offset: int, why: object) -> DamageError:
         """The error for bytes that can not be parsed."""
@@ -164,6 +193,9 @@ class McapReader:
 
     def read_summary(self) -> Summary:
         """The summary section, checksum verified; nothing in it lies outside the file or over something else."""
+        if self._summary is not None:
+            found, self._summary = self._summary, None  # once, because who asks changes it
+            return found
         tail = self.read(max(0, self.size - FOOTER_BYTES - len(MAGIC)), min(self.size, FOOTER_BYTES + len(MAGIC)))
         if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != FOOTER_BYTES + len(MAGIC):
             raise UnfinishedError(
@@ -306,12 +338,12 @@ class McapReader:
         if self.read(0, min(self.size, len(MAGIC))) != MAGIC:
             meant = _READ_BY.get(self.path.suffix.lower(), "flowrec reads what `flowrec record` has written")
             raise ForeignError(f"{self.path}: is not an MCAP file; {meant}")
-        data = self.read(len(MAGIC), min(self.size - len(MAGIC), _HEADER_LIMIT_BYTES))
+        at = len(MAGIC) + RECORD_HEAD.size
         with self.parsing(len(MAGIC)):
-            opcode, length = RECORD_HEAD.unpack_from(data)
-            if opcode != Opcode.HEADER or length > len(data) - RECORD_HEAD.size:
+            opcode, length = RECORD_HEAD.unpack(self.read(len(MAGIC), min(self.size - len(MAGIC), RECORD_HEAD.size)))
+            if opcode != Opcode.HEADER or length > min(self.size - at, _HEADER_LIMIT_BYTES):
                 raise ValueError("no header record")
-            header: Header = Header.read(stream_of(data[RECORD_HEAD.size :][:length]))
+            header: Header = Header.read(stream_of(self.read(at, length)))
         return header
 
     def body(self, offset: int, length: int, opcode: Opcode) -> memoryview:

@@ -166,6 +166,7 @@ def scan(
     ------
     SessionError : the file can not be read.
     """
+    source.read_originals()
     found = Scan(source, visit, source.start_unix_ns if digests else None)
     at = len(MAGIC)
     # What looks like a chunk after damage may be none, and overlap the next one: the cost of trying is bounded.
