@@ -81,7 +81,7 @@ class LocalFile:
                 data = os.read(self._descriptor, length)
         return data
 
-    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+    def prefetch(self, ranges: Iterable[tuple[int, int]], gap_bytes: int | None = None) -> None:
         """Ranges (offset, length) that will be read soon, each once: the operating system reads ahead by itself."""
 
     def close(self) -> None:

@@ -2,8 +2,7 @@
 
 Small messages are written between images, twice a second, so that a killed run keeps them; all poses of a session are
 then as many ranges. When a file is complete, attachments repeat these ranges next to each other, 2 % of a file:
-the chunks of the state, their message indexes, those of the images, and at last, nearest to the index of the file, the
-records of its head. Which ranges these are follows from the index alone, and a checksum of them is in the names of the
+the chunks of the state, their message indexes, and those of the images. Which ranges these are follows from the index alone, and a checksum of them is in the names of the
 attachments: where another program has rewritten the file, its copies are of nothing, and are passed over.
 
 The bytes are complemented, so that who searches a damaged file for chunks does not find them twice. The copies are
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 _PREFIX = "gathered/"
 _MEDIA_TYPE = "application/octet-stream"
 _PIECE_BYTES = 32 << 20  # of one attachment, which readers of other programs hold in memory
-_SMALL_BYTES = 1 << 16  # of a record of the head; weights of networks are larger
 _IMAGES_BYTES, _IMAGES_SHARE = 1 << 20, 4  # fewer images, or few beside the state, are no obstacle
 _FRAME_PATH = BY_FIELD["frame"].path
 _COMPLEMENT = bytes(255 - value for value in range(256))
@@ -59,7 +57,7 @@ class GatheredCopies:
         places = sorted((each for each in listed.attachments if is_copy(each.name)), key=lambda each: each.offset)
         self.pieces: list[tuple[list[Range], int]] = []
         if places:
-            expected = list(_pieces(_ranges(listed, places[0].offset)))
+            expected = list(_pieces(_ranges(listed)))
             described = [(name, _size(ranges)) for name, ranges in expected]
             if described == [(each.name, each.data_size) for each in places]:
                 begins = (each.offset + each.length - CRC.size - each.data_size for each in places)
@@ -111,13 +109,13 @@ def gather(path: Path, out: McapWriter, start_unix_ns: int) -> None:
     SessionError : the file can not be read back. OSError : the disk refuses.
     """
     with contextlib.closing(open_bytes(path)) as source:
-        for name, ranges in _pieces(_ranges(out.summary(), out.size)):
+        for name, ranges in _pieces(_ranges(out.summary())):
             data = b"".join(complement(source.read(offset, length)) for offset, length in ranges)
             out.add(Attachment(start_unix_ns, start_unix_ns, name, _MEDIA_TYPE, data))
 
 
-def _ranges(listed: Summary, end: int) -> list[Range]:
-    """The ranges before `end` that lookups read, in the order of their copies; none where there are few images."""
+def _ranges(listed: Summary) -> list[Range]:
+    """The ranges that lookups read, in the order of their copies; none where there are few images."""
     frames = {number for number, channel in listed.channels.items() if channel.topic == _FRAME_PATH}
     views = {number for number, channel in listed.channels.items() if channel.metadata.get("role") == "view"}
     state: list[Range] = []
@@ -137,9 +135,7 @@ def _ranges(listed: Summary, end: int) -> list[Range]:
             indexes.append(index)
     if images_bytes < max(_IMAGES_BYTES, _IMAGES_SHARE * _size(state)):
         return []
-    records = sorted((each.offset, each.length) for each in (*listed.metadata, *listed.attachments))
-    head = [(0, records[0][0]), *records] if records else []
-    return [*state, *indexes, *of_frames, *(part for part in head if part[0] < end and part[1] <= _SMALL_BYTES)]
+    return [*state, *indexes, *of_frames]
 
 
 def _pieces(ranges: list[Range]) -> Iterator[tuple[str, list[Range]]]:

@@ -28,11 +28,13 @@ from mcap.records import (
     Metadata,
     MetadataIndex,
     Schema,
+    SummaryOffset,
 )
 
 from flowrec.core import MOVIE_FILES, SessionError
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.gathered_copies import GatheredCopies, complement
+from flowrec.store.lookup_record import LOOKUP_OPCODE, Piece, parse_lookup
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
     CHUNK_HEAD,
@@ -57,7 +59,8 @@ _FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
 _AT_ONCE_BYTES, _WINDOW_LIMIT_BYTES = 8 << 20, 8 << 20
 _HEADER_LIMIT_BYTES = 1 << 16
 _SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
-_COPIES_GAP_BYTES = 1 << 20  # between copies is what belongs to them
+# What is read in vain between copies, and between images whose state has copies, instead of one more request.
+_COPIES_GAP_BYTES, _IMAGES_GAP_BYTES = 1 << 20, 256 << 10
 _SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
 _PARSED: dict[Opcode, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 _LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: 256 << 20}
@@ -70,6 +73,7 @@ _DAMAGE = (
     struct.error,
     ValueError,
     KeyError,
+    TypeError,
     IndexError,
     OverflowError,
     MemoryError,
@@ -119,6 +123,7 @@ class McapReader:
         self._bytes = open_bytes(path)
         self.size, self.close = self._bytes.size, self._bytes.close
         self._summary: Summary | None = None  # that was read to find the copies
+        self._pieces: list[Piece] = []
         self._copies: GatheredCopies | None = None
         try:
             if self._bytes.is_far:
@@ -143,6 +148,9 @@ class McapReader:
         """Exactly that many bytes."""
         if not 0 <= offset <= offset + length <= self.size:
             raise self.damage_error(offset, f"{length} bytes are announced, the file ends at {self.size}")
+        for first, known in self._pieces:
+            if first <= offset and offset + length <= first + len(known):
+                return known[offset - first : offset - first + length]
         copy = self._copies.place_of(offset, length) if self._copies is not None else None
         data = self._bytes.read(offset if copy is None else copy, length)
         if len(data) < length:
@@ -151,7 +159,7 @@ class McapReader:
 
     def read_originals(self) -> None:
         """Read every record where it stands from now on, none from its copy."""
-        self._copies = None
+        self._copies, self._pieces = None, []
 
     def prefetch(self, chunks: Iterable[ChunkIndex], *, indexes: bool = False) -> None:
         """Announce that these chunks, or the indexes after them, will be read soon: one round trip for a URL."""
@@ -171,12 +179,14 @@ class McapReader:
             else:
                 copies.append((copy, length))
         self._bytes.prefetch(copies, _COPIES_GAP_BYTES)
-        self._bytes.prefetch(elsewhere)
+        self._bytes.prefetch(elsewhere, _IMAGES_GAP_BYTES if copies else None)
 
     def _find_copies(self) -> None:
-        """Find the copies of a file at a URL by its index."""
+        """Read what a file at a URL repeats at its end for those who read it there."""
         with contextlib.suppress(DamageError, UnfinishedError):  # raised again where the index is wanted
-            self._summary = self.read_summary()
+            footer, footer_at, tail = self._footer()
+            found = self._lookup(footer, footer_at)
+            self._summary, self._pieces = found or (self._long_summary(footer, footer_at, tail), [])
             self._copies = GatheredCopies(self._summary)
 
     def damage_error(self, offset: int, why: object) -> DamageError:
@@ -196,6 +206,23 @@ class McapReader:
         if self._summary is not None:
             found, self._summary = self._summary, None  # once, because who asks changes it
             return found
+        return self._long_summary(*self._footer())
+
+    def lookup_agrees(self) -> bool:
+        """False if the lookup record repeats something else than what other programs read."""
+        footer, footer_at, tail = self._footer()
+        try:
+            found = self._lookup(footer, footer_at)
+        except DamageError:
+            return False
+        if found is None:
+            return True
+        short, pieces = found
+        same = all(self.read(offset, len(data)) == data for offset, data in pieces)
+        return same and short.chunks == self._long_summary(footer, footer_at, tail).chunks
+
+    def _footer(self) -> tuple[Footer, int, bytes]:
+        """The footer, its offset, and the bytes from there on."""
         tail = self.read(max(0, self.size - FOOTER_BYTES - len(MAGIC)), min(self.size, FOOTER_BYTES + len(MAGIC)))
         if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != FOOTER_BYTES + len(MAGIC):
             raise UnfinishedError(
@@ -207,6 +234,9 @@ class McapReader:
             footer = Footer.read(stream_of(tail[9:]))
         if footer.summary_start == 0:
             raise UnfinishedError(f"{self.path}: has no index; `flowrec recover {self.path}` makes one")
+        return footer, footer_at, tail
+
+    def _long_summary(self, footer: Footer, footer_at: int, tail: bytes) -> Summary:
         start = footer.summary_start
         if footer_at - start > _SUMMARY_LIMIT_BYTES:
             raise self.damage_error(start, f"an index of {footer_at - start} bytes, more than {_SUMMARY_LIMIT_BYTES}")
@@ -215,6 +245,26 @@ class McapReader:
             raise self.damage_error(start, "the checksum of the index is wrong")
         with self.parsing(start):
             return parse_summary(data, start)
+
+    def _lookup(self, footer: Footer, footer_at: int) -> tuple[Summary, list[Piece]] | None:
+        """Summary and records of the head, by the lookup record at the end of the file; None where there is none."""
+        at = footer.summary_offset_start
+        if not 0 < at < footer_at < at + _SMALL_LIMIT_BYTES:
+            return None
+        offsets = self.read(at, footer_at - at)
+        with self.parsing(at):
+            groups = [SummaryOffset.read(stream_of(offsets[begin : begin + n])) for _, begin, n in records_in(offsets)]
+            places = {group.group_opcode: (group.group_start, group.group_length) for group in groups}
+            if LOOKUP_OPCODE not in places:
+                return None
+            begin = sum(places.get(Opcode.CHUNK_INDEX, (footer.summary_start, 0)))
+            lookup_at, nbytes = places[LOOKUP_OPCODE]
+            if footer_at - begin > _SUMMARY_LIMIT_BYTES or lookup_at + nbytes > footer_at:
+                raise ValueError("the groups of the index are not where it says")
+            between = self.read(begin, lookup_at - begin)
+            body = self.read(lookup_at, nbytes)[RECORD_HEAD.size :]
+            chunks, pieces = parse_lookup(body, between, footer.summary_start)
+            return parse_summary(between, footer.summary_start, chunks), pieces
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""

@@ -27,7 +27,7 @@ from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout
 
 _END_BYTES, _HEAD_BYTES = 512 << 10, 256 << 10
 _AHEAD_BYTES = 64 << 20
-_GAP_BYTES, _JOINED_BYTES = 256 << 10, 16 << 20  # what is read in vain takes less time than one more request
+_GAP_BYTES, _JOINED_BYTES = 64 << 10, 16 << 20
 _BLOCK_BYTES = 4 << 20  # for who reads on
 _NEAR_BYTES = 1 << 20  # what is read so near before the known end is fetched up to it
 _REMEMBERED, _REMEMBERED_S = 64, 60.0
@@ -117,8 +117,9 @@ class RemoteFile:
             answer = self._fetch_unannounced(offset, end)
         return answer.data[offset - answer.first : end - answer.first]
 
-    def prefetch(self, ranges: Iterable[tuple[int, int]], gap_bytes: int = _GAP_BYTES) -> None:
+    def prefetch(self, ranges: Iterable[tuple[int, int]], gap_bytes: int | None = None) -> None:
         """Ask for ranges (offset, length) that will be read soon; those with no larger gap between are one request."""
+        gap = _GAP_BYTES if gap_bytes is None else gap_bytes
         with self._lock:
             known: list[Answer | _Ahead] = [*self._object.known, *self._ahead]
             room = _AHEAD_BYTES - sum(each.end - each.first for each in self._ahead)
@@ -128,7 +129,7 @@ class RemoteFile:
                 if length > _JOINED_BYTES or any(_holds(each, offset, end) for each in known):
                     continue
                 last_one = joined[-1] if joined else None
-                if last_one and offset - last_one[1] <= gap_bytes and end - last_one[0] <= _JOINED_BYTES:
+                if last_one and offset - last_one[1] <= gap and end - last_one[0] <= _JOINED_BYTES:
                     last_one[1], last_one[2] = max(last_one[1], end), last_one[2] + 1
                 else:
                     joined.append([offset, end, 1])
