@@ -196,7 +196,7 @@ class FileReader(SessionContents):
     def _read(
         self, fields: Collection[str], start_ns: int = 0, end_ns: int | None = None, *, whole: bool = False
     ) -> Iterator[Record]:
-        """The messages of some topics from a time to before another, state and frames merged; `whole`: all are wanted."""
+        """The messages of some topics from a time to before another, state and frames merged; `whole`: all of them."""
         wanted = self._channels_of(fields)
         state, frames = self._chunks_from(start_ns, wanted, end_ns)
         with _threads() as executor:
@@ -354,11 +354,13 @@ class _Announced:
         self._begun += count
         while self._end < min(self._begun + self._count // 2, len(self._bundles)):
             batch: list[ChunkIndex] = []
-            nbytes = number = 0
-            while self._end < len(self._bundles) and nbytes < _ANNOUNCED_BYTES and (self._whole or number < self._count):
-                batch += self._bundles[self._end]
-                nbytes += sum(chunk.chunk_length for chunk in self._bundles[self._end])
-                self._end, number = self._end + 1, number + 1
+            nbytes = 0
+            for bundle in self._bundles[self._end : None if self._whole else self._end + self._count]:
+                batch += bundle
+                nbytes += sum(chunk.chunk_length for chunk in bundle)
+                self._end += 1
+                if nbytes > _ANNOUNCED_BYTES:
+                    break
             self._source.prefetch(batch)
             self._count = min(2 * self._count, _AHEAD_CHUNKS)
 

@@ -1,8 +1,8 @@
-"""The last record of the summary section: what opening a file at a URL takes, within the last half megabyte of any file.
+"""The last record of the summary section: all that opens a file at a URL, within the last half megabyte of the file.
 
 The index of 10 GB of small images has 3 MB, nearly all of which is the list of chunks, and the head of a file is at its
-other end; each would be another request. So the last record of the summary repeats the list of chunks, as columns
-of differences in a tenth of its size, and the records of the head. It has one of the opcodes that the MCAP specification
+other end; each would be another request. So the last record of the summary repeats the list of chunks, as columns of
+differences in a tenth of its size, and the records of the head. It has one of the opcodes that the specification of MCAP
 leaves to applications, so readers of other programs pass over it. `check` compares it with what it repeats.
 
 The record: CRC-32 of what stands between the list of chunks and the record, and of the record; then, as zstd: number of
@@ -20,9 +20,10 @@ from array import array
 from collections.abc import Iterable, Sequence
 
 import zstandard
-from mcap.records import ChunkIndex
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, SummaryOffset
 
-from flowrec.store.mcap_format import CRC, RECORD_HEAD
+from flowrec.store.mcap_format import CRC, RECORD_HEAD, records_in, stream_of
 
 # From 0x80 on, opcodes are free for applications (https://mcap.dev/spec).
 LOOKUP_OPCODE = 0xF1
@@ -55,12 +56,35 @@ def lookup_record(chunks: Sequence[ChunkIndex], pieces: Sequence[Piece], between
     return RECORD_HEAD.pack(LOOKUP_OPCODE, len(body)) + body
 
 
+def place_of_lookup(offsets: bytes, summary_at: int, footer_at: int) -> tuple[int, int, int] | None:
+    """Where what follows the list of chunks begins, offset and length of the lookup record; None where there is none.
+
+    Parameters
+    ----------
+    offsets : the summary offset section.
+    summary_at, footer_at : begin of the summary section, and of the footer.
+
+    Raises
+    ------
+    ValueError, struct.error, mcap.exceptions.McapError : it is damaged.
+    """
+    groups = [SummaryOffset.read(stream_of(offsets[at : at + length])) for _, at, length in records_in(offsets)]
+    places = {group.group_opcode: (group.group_start, group.group_length) for group in groups}
+    if LOOKUP_OPCODE not in places:
+        return None
+    begin = sum(places.get(Opcode.CHUNK_INDEX, (summary_at, 0)))
+    at, nbytes = places[LOOKUP_OPCODE]
+    if not footer_at - _LIMIT_BYTES < begin <= at <= at + nbytes <= footer_at:
+        raise ValueError("the groups of the index are not where it says")
+    return begin, at, nbytes
+
+
 def parse_lookup(body: bytes, between: bytes, data_end: int) -> tuple[list[ChunkIndex], list[Piece]]:
     """The chunks and the pieces that a record repeats.
 
     Raises
     ------
-    ValueError, TypeError, struct.error, zstandard.ZstdError : it is damaged, or what it lists is not in `data_end` bytes.
+    ValueError, TypeError, struct.error, zstandard.ZstdError : it is damaged, or lists what is not in `data_end` bytes.
     """
     (crc,) = CRC.unpack_from(body)
     data = body[CRC.size :]
@@ -82,9 +106,7 @@ def parse_lookup(body: bytes, between: bytes, data_end: int) -> tuple[list[Chunk
     return _chunks(zip(*columns, strict=True), kinds, data_end), pieces
 
 
-def _chunks(
-    rows: Iterable[tuple[int, ...]], kinds: Sequence[tuple[str, list[int]]], data_end: int
-) -> list[ChunkIndex]:
+def _chunks(rows: Iterable[tuple[int, ...]], kinds: Sequence[tuple[str, list[int]]], data_end: int) -> list[ChunkIndex]:
     shared = [(str(name), dict.fromkeys(map(int, channels), 0)) for name, channels in kinds]
     found = []
     begin_ns = end = listed_bytes = 0

@@ -28,13 +28,12 @@ from mcap.records import (
     Metadata,
     MetadataIndex,
     Schema,
-    SummaryOffset,
 )
 
 from flowrec.core import MOVIE_FILES, SessionError
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.gathered_copies import GatheredCopies, complement
-from flowrec.store.lookup_record import LOOKUP_OPCODE, Piece, parse_lookup
+from flowrec.store.lookup_record import Piece, parse_lookup, place_of_lookup
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
     CHUNK_HEAD,
@@ -248,23 +247,17 @@ class McapReader:
 
     def _lookup(self, footer: Footer, footer_at: int) -> tuple[Summary, list[Piece]] | None:
         """Summary and records of the head, by the lookup record at the end of the file; None where there is none."""
-        at = footer.summary_offset_start
-        if not 0 < at < footer_at < at + _SMALL_LIMIT_BYTES:
+        offsets_at, begin = footer.summary_offset_start, footer.summary_start
+        if not 0 < offsets_at < footer_at < offsets_at + _SMALL_LIMIT_BYTES:
             return None
-        offsets = self.read(at, footer_at - at)
-        with self.parsing(at):
-            groups = [SummaryOffset.read(stream_of(offsets[begin : begin + n])) for _, begin, n in records_in(offsets)]
-            places = {group.group_opcode: (group.group_start, group.group_length) for group in groups}
-            if LOOKUP_OPCODE not in places:
+        with self.parsing(offsets_at):
+            place = place_of_lookup(self.read(offsets_at, footer_at - offsets_at), begin, footer_at)
+            if place is None:
                 return None
-            begin = sum(places.get(Opcode.CHUNK_INDEX, (footer.summary_start, 0)))
-            lookup_at, nbytes = places[LOOKUP_OPCODE]
-            if footer_at - begin > _SUMMARY_LIMIT_BYTES or lookup_at + nbytes > footer_at:
-                raise ValueError("the groups of the index are not where it says")
-            between = self.read(begin, lookup_at - begin)
-            body = self.read(lookup_at, nbytes)[RECORD_HEAD.size :]
-            chunks, pieces = parse_lookup(body, between, footer.summary_start)
-            return parse_summary(between, footer.summary_start, chunks), pieces
+            between_at, at, nbytes = place
+            between = self.read(between_at, at - between_at)
+            chunks, pieces = parse_lookup(self.read(at, nbytes)[RECORD_HEAD.size :], between, begin)
+            return parse_summary(between, begin, chunks), pieces
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""

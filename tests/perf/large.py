@@ -129,7 +129,9 @@ def _write(path: Path, load: Load, seconds_long: float, with_frames: bool) -> It
     """Write chunks as the writer does, without the pixels; yields the time written, s."""
     rng = np.random.default_rng(0)
     payloads = {
-        topic.path: encode(made_up(topic.type, _START_NS, 0, rng)) for topic in TOPICS if topic.field in _PER_TICK
+        topic.path: encode(made_up(topic.type, _START_NS, 0, rng))  # type: ignore[no-untyped-call]
+        for topic in TOPICS
+        if topic.field in _PER_TICK
     }
     period_ns = round(NS_PER_S / load.rate_hz)
     per_flush = round(_FLUSH_S * load.rate_hz)

@@ -71,7 +71,10 @@ def show_soak(found: dict[str, Any]) -> None:
     rows = [(name, f"{found[name]}") for name in ("status", "images", "dropped", "missing", "clocks")]
     rows += [("file", f"{found['file_mb']:.0f} MB"), ("wall clock against monotonic", f"{found['wall_ppm']:.2f} ppm")]
     rows += [
-        (f"memory of {kind}", f"{each['first_mb']:.0f} to {each['last_mb']:.0f} MB, {each['mb_per_minute']:+.2f} a minute")
+        (
+            f"memory of {kind}",
+            f"{each['first_mb']:.0f} to {each['last_mb']:.0f} MB, {each['mb_per_minute']:+.2f} a minute",
+        )
         for kind, each in found["processes"].items()
     ]
     rows += [

@@ -119,7 +119,9 @@ def test_a_lookup_record_of_another_file_is_found(session: Path, tmp_path: Path,
     grown = len(body) - (end - begin)
     data[begin - 8 : end] = len(body).to_bytes(8, "little") + body
     footer = len(data) - 37 + RECORD_HEAD.size  # the summary begins where it did, its offsets follow the record
-    data[footer + 8 : footer + 16] = (int.from_bytes(data[footer + 8 : footer + 16], "little") + grown).to_bytes(8, "little")
+    data[footer + 8 : footer + 16] = (int.from_bytes(data[footer + 8 : footer + 16], "little") + grown).to_bytes(
+        8, "little"
+    )
     lookup_offset = data.rindex(bytes([LOOKUP_OPCODE]), 0, footer - RECORD_HEAD.size)
     data[lookup_offset + 9 : lookup_offset + 17] = (len(body) + RECORD_HEAD.size).to_bytes(8, "little")
     data[footer + 16 : footer + 20] = bytes(4)  # no checksum
