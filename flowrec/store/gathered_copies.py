@@ -2,8 +2,8 @@
 
 Small messages are written between images, twice a second, so that a killed run keeps them; all poses of a session are
 then as many ranges. When a file is complete, attachments repeat these ranges next to each other, 2 % of a file: the
-chunks of the state, their message indexes, and those of the images. Which ranges these are follows from the index alone,
-and a checksum of them is in the names of the attachments: where another program has rewritten the file, its copies are of
+chunks of the state, their message indexes, and those of the images. Which ranges these are follows from the index, and
+a checksum of them is in the names of the attachments: where another program has rewritten the file, its copies are of
 nothing, and are passed over.
 
 The bytes are complemented, so that who searches a damaged file for chunks does not find them twice. The copies are

@@ -2,8 +2,8 @@
 
 The index of 10 GB of small images has 3 MB, nearly all of which is the list of chunks, and the head of a file is at its
 other end; each would be another request. So the last record of the summary repeats the list of chunks, as columns of
-differences in a tenth of its size, and the records of the head. It has one of the opcodes that the specification of MCAP
-leaves to applications, so readers of other programs pass over it. `check` compares it with what it repeats.
+differences in a tenth of its size, and the records of the head. Its opcode is one that the specification of MCAP leaves
+to applications, so readers of other programs pass over it. `check` compares it with what it repeats.
 
 The record: CRC-32 of what stands between the list of chunks and the record, and of the record; then, as zstd: number of
 chunks, length of a JSON text, that text, eight columns of 64 bits, the repeated records. The text lists compression and

@@ -61,7 +61,9 @@ def soak_run(minutes: float, folder: Path | None = None, settings: tuple[str, ..
         late = (f"--from={start_s:g}",) if start_s > 0.0 else ()
         for verb, more in (("check", ()), ("replay", ("--verify", *late))):
             begun_s = time.monotonic()
-            told = subprocess.run(_flowrec(verb, str(path), *more, "--json"), capture_output=True, text=True)
+            told = subprocess.run(
+                _flowrec(verb, str(path), *more, "--json"), check=False, capture_output=True, text=True
+            )
             found[verb] = {"status": told.returncode, "s": time.monotonic() - begun_s, "said": _last_line(told)}
         return found
 
@@ -136,7 +138,7 @@ def _growth(rows: list[tuple[float, float]]) -> dict[str, float]:
 
 def _drift_ppm(session: flowrec.Session) -> float:
     """Wall clock against monotonic clock over the run, by the first and the last reading of both."""
-    read = [message for message in session.messages("clocks")]
+    read = list(session.messages("clocks"))
     if len(read) < 2:
         return float("nan")
     wall_ns = read[-1].wall_ns - read[0].wall_ns

@@ -61,7 +61,7 @@ QUESTIONS: dict[str, Callable[[str], Any]] = {
 
 @dataclass(slots=True)
 class Trips:
-    """Round trips: requests that arrive while none waits. Each waits for the latency, beside those that come meanwhile."""
+    """Round trips: requests that arrive while none waits; each waits for the latency."""
 
     latency_s: float
     count: int = 0

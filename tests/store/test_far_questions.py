@@ -1,4 +1,4 @@
-"""Any question about a session at a URL takes three requests in two round trips, and the copies that allow it are safe."""
+"""Any question about a session at a URL takes three requests in two round trips; the copies for it are right."""
 
 from __future__ import annotations
 
