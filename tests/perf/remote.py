@@ -5,8 +5,8 @@
 Of Starlette's static files under uvicorn, and of moto's S3 server, which take the same number. Without a session: of a
 sparse one (large.py), whose images are holes, so that it is not asked for them. Requests, round trips and MB of 82 MB,
 8 s of 640 x 512 at 60 Hz: open 1, 1, 0.5; one image 2, 2, 1.0; one second of everything 3, 2, 12.5; all poses 2, 2,
-1.3; times of all images 1, 1, 0.5; one field 2, 2, 1.1; info 2, 2, 0.5 (one asks for notes). Of 10 GB, 305 s at 100 Hz: open
-1, 1, 0.5; one second without images 2, 2, 0.5; all poses 2, 2, 1.9; times of all images 2, 2, 1.1.
+1.3; times of all images 1, 1, 0.5; one field 2, 2, 1.1; info 2, 2, 0.5 (one asks for notes). Of 10 GB, 305 s at 100 Hz:
+open 1, 1, 0.5; one second without images 2, 2, 0.5; all poses 2, 2, 1.9; times of all images 2, 2, 1.1.
 
 At least one request is for the end of the file, and one for what is asked for; a second of everything stands in two
 places, with its images and in the copies of the state. What is asked for at a time is bounded: the poses of 10 GB whose

@@ -27,8 +27,8 @@ from tests.perf import store_equal
 from tests.perf.store_kills import kills
 from tests.perf.store_kills import show as show_kills
 from tests.perf.store_loop import soak, stall
-from tests.perf.store_soak import show_soak, soak_run
 from tests.perf.store_region import regions
+from tests.perf.store_soak import show_soak, soak_run
 from tests.perf.store_splits import show_splits, splits
 from tests.perf.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
 
