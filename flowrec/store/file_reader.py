@@ -350,9 +350,9 @@ class _Announced:
         self._count = _AHEAD_AT_FIRST
 
     def begin(self, count: int) -> None:
-        """So many more begin; the next batch is announced when half of the last one has begun."""
+        """So many more begin, long before they are read; the next batch is announced where the last one ends."""
         self._begun += count
-        while self._end < min(self._begun + self._count // 2, len(self._bundles)):
+        while self._end < min(self._begun, len(self._bundles)):
             batch: list[ChunkIndex] = []
             nbytes = 0
             for bundle in self._bundles[self._end : None if self._whole else self._end + self._count]:
@@ -362,7 +362,7 @@ class _Announced:
                 if nbytes > _ANNOUNCED_BYTES:
                     break
             self._source.prefetch(batch)
-            self._count = min(2 * self._count, _AHEAD_CHUNKS)
+            self._count = min(self._count + self._count // 2, _AHEAD_CHUNKS)
 
 
 def _overlapping(source: McapReader, chunks: list[ChunkIndex]) -> Iterator[list[ChunkIndex]]:

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING
 
 from mcap.records import Attachment
 
-from flowrec.core import BY_FIELD
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.mcap_format import CRC, Summary
 
@@ -35,7 +34,7 @@ _PREFIX = "gathered/"
 _MEDIA_TYPE = "application/octet-stream"
 _PIECE_BYTES = 32 << 20  # of one attachment, which readers of other programs hold in memory
 _IMAGES_BYTES, _IMAGES_SHARE = 1 << 20, 4  # fewer images, or few beside the state, are no obstacle
-_FRAME_PATH = BY_FIELD["frame"].path
+_OF_IMAGES = "lossless"  # in the metadata of the images' channel alone
 _COMPLEMENT = bytes(255 - value for value in range(256))
 
 Range = tuple[int, int]  # offset in the file and number of bytes
@@ -117,7 +116,7 @@ def gather(path: Path, out: McapWriter, start_unix_ns: int) -> None:
 
 def _ranges(listed: Summary) -> list[Range]:
     """The ranges that lookups read, in the order of their copies; none where there are few images."""
-    frames = {number for number, channel in listed.channels.items() if channel.topic == _FRAME_PATH}
+    frames = {number for number, channel in listed.channels.items() if _OF_IMAGES in channel.metadata}
     views = {number for number, channel in listed.channels.items() if channel.metadata.get("role") == "view"}
     state: list[Range] = []
     indexes: list[Range] = []
