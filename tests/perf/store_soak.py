@@ -55,7 +55,7 @@ def soak_run(minutes: float, folder: Path | None = None, settings: tuple[str, ..
             "missing": outcome.get("frames_missing_from_camera", 0),
             "clocks": outcome.get("clocks", "not stated"),
             "wall_ppm": _drift_ppm(session),
-            "processes": {f"{names[process]} ({process})": _growth(rows) for process, rows in memory.items()},
+            "own_mb": {f"{names[process]} ({process})": _growth(rows, seconds) for process, rows in memory.items()},
         }
         start_s = session.duration_s - _VERIFIED_S
         late = (f"--from={start_s:g}",) if start_s > 0.0 else ()
@@ -74,10 +74,10 @@ def show_soak(found: dict[str, Any]) -> None:
     rows += [("file", f"{found['file_mb']:.0f} MB"), ("wall clock against monotonic", f"{found['wall_ppm']:.2f} ppm")]
     rows += [
         (
-            f"memory of {kind}",
+            f"own memory of {kind}",
             f"{each['first_mb']:.0f} to {each['last_mb']:.0f} MB, {each['mb_per_minute']:+.2f} a minute",
         )
-        for kind, each in found["processes"].items()
+        for kind, each in found["own_mb"].items()
     ]
     rows += [
         (verb, f"status {found[verb]['status']}, {found[verb]['s']:.0f} s: {found[verb]['said']}")
@@ -116,21 +116,23 @@ def _name(process: int) -> str:
 
 
 def _memory_mb(process: int) -> float:
+    """Memory of its own, without what is shared, as the ring of images is."""
     try:
         lines = Path(f"/proc/{process}/status").read_text().splitlines()
     except OSError:
         return float("nan")
-    return next((float(line.split()[1]) / 1e3 for line in lines if line.startswith("VmRSS:")), float("nan"))
+    return next((float(line.split()[1]) / 1e3 for line in lines if line.startswith("RssAnon:")), float("nan"))
 
 
-def _growth(rows: list[tuple[float, float]]) -> dict[str, float]:
-    """Memory when it had settled and at the end, and the slope between, in MB and MB a minute."""
+def _growth(rows: list[tuple[float, float]], until_s: float) -> dict[str, float]:
+    """Memory when it had settled and when the time is over, the slope between, and the highest, also at the close."""
     at_s, mb = np.array([row for row in rows if np.isfinite(row[1])] or [(0.0, 0.0)]).T
-    settled = at_s >= min(_WARM_S, 0.5 * at_s[-1])
+    settled = (at_s >= min(_WARM_S, 0.5 * until_s)) & (at_s <= until_s)
+    settled |= not settled.any()
     slope = np.polyfit(at_s[settled], mb[settled], 1)[0] * 60.0 if settled.sum() > 2 else 0.0
     return {
         "first_mb": float(mb[settled][0]),
-        "last_mb": float(mb[-1]),
+        "last_mb": float(mb[settled][-1]),
         "highest_mb": float(mb.max()),
         "mb_per_minute": float(slope),
     }
@@ -151,4 +153,6 @@ def _last_line(told: subprocess.CompletedProcess[str]) -> str:
         said = json.loads(told.stdout)
     except ValueError:
         return (told.stderr.strip().splitlines() or ["nothing"])[-1]
-    return str(next((said[key] for key in ("verdict", "findings", "summary") if key in said), "")) or "no findings"
+    if "identical" in said:
+        return f"{said['ticks'] - said['different_ticks']} of {said['ticks']} ticks the same"
+    return str(said.get("verdict") or said.get("findings") or "no findings")
