@@ -362,7 +362,7 @@ class _Announced:
                 if nbytes > _ANNOUNCED_BYTES:
                     break
             self._source.prefetch(batch)
-            self._count = min(self._count + self._count // 2, _AHEAD_CHUNKS)
+            self._count = min(max(self._count, self._end // 4), _AHEAD_CHUNKS)
 
 
 def _overlapping(source: McapReader, chunks: list[ChunkIndex]) -> Iterator[list[ChunkIndex]]:

@@ -57,7 +57,7 @@ def lookup_record(chunks: Sequence[ChunkIndex], pieces: Sequence[Piece], between
 
 
 def place_of_lookup(offsets: bytes, summary_at: int, footer_at: int) -> tuple[int, int, int] | None:
-    """Where what follows the list of chunks begins, offset and length of the lookup record; None where there is none.
+    """Begin of what follows the list of chunks, offset and length of the lookup record; None where there is none.
 
     Parameters
     ----------

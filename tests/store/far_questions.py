@@ -1,4 +1,4 @@
-"""What is asked of a session at a URL, and how many requests in how many round trips the answer takes."""
+"""Questions about a session at a URL, and how many requests in how many round trips the answers take."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Trips:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What an answer took."""
+    """Price of an answer."""
 
     requests: int
     trips: int

@@ -12,6 +12,7 @@ import zstandard
 from mcap.reader import NonSeekingReader, make_reader
 
 import flowrec
+from flowrec.core.errors import UsageError
 from flowrec.store.channels import SessionContents
 from flowrec.store.gathered_copies import GatheredCopies, is_copy
 from flowrec.store.lookup_record import LOOKUP_OPCODE
@@ -82,6 +83,20 @@ def test_what_is_read_at_a_url_is_what_stands_in_the_file(session: Path, static:
     static[1].latency_s = 0.0
     assert flowrec.compare(session, static[0]).identical
     assert flowrec.check(session).findings == flowrec.check(static[0]).findings
+
+
+def test_ticks_end_before_the_time_that_is_given(session: Path) -> None:
+    opened = flowrec.open(session)
+    first_s = opened.run.first_ns / 1e9
+    every = [tick.stamp_ns for tick in opened.ticks()]
+    from_s, to_s = first_s + 1.0, first_s + 2.0
+    assert [tick.stamp_ns for tick in opened.ticks(from_s, to_s)] == [
+        stamp for stamp in every if from_s <= stamp / 1e9 < to_s
+    ]
+    assert [tick.stamp_ns for tick in opened.ticks(end_s=to_s)] == [stamp for stamp in every if stamp / 1e9 < to_s]
+    assert [tick.stamp_ns for tick in opened.ticks(end_s=1e9)] == every
+    with pytest.raises(UsageError, match="runs from"):
+        next(opened.ticks(end_s=float("nan")))
 
 
 def test_readers_of_other_programs_pass_over_the_copies(session: Path) -> None:
