@@ -219,7 +219,7 @@ def disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool
             yield False, f"{len(apart)} {what} are only in the index, or only outside it"
     if not contents.source.lookup_agrees():
         yield True, "the lookup record, which is read at a URL, is not of this file"
-    if wrong := GatheredCopies(contents.source.read_summary()).wrong(contents.source):
+    if wrong := GatheredCopies(contents.source.read_summary()).wrong(contents.source.read):
         yield True, f"{wrong} records have other copies at the end of the file, where they are read at a URL"
 
 

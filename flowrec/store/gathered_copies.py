@@ -17,18 +17,13 @@ import contextlib
 import itertools
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mcap.records import Attachment
 
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.mcap_format import CRC, Summary
-
-if TYPE_CHECKING:
-    from flowrec.store.mcap_reader import McapReader
-    from flowrec.store.mcap_writer import McapWriter
 
 _PREFIX = "gathered/"
 _MEDIA_TYPE = "application/octet-stream"
@@ -76,18 +71,18 @@ class GatheredCopies:
         first, end, at = self._places[number]
         return at + offset - first if offset + length <= end else None
 
-    def wrong(self, source: McapReader) -> int:
+    def wrong(self, read: Callable[[int, int], bytes]) -> int:
         """Number of ranges that differ from their copies.
 
         Parameters
         ----------
-        source : the file, read where its records stand.
+        read : reads the file where its records stand, by offset and length.
         """
         wrong = 0
         for ranges, begin in self.pieces:
-            copies = source.read(begin, _size(ranges))
+            copies = read(begin, _size(ranges))
             for (offset, length), at in zip(ranges, _starts(ranges, 0), strict=False):
-                wrong += source.read(offset, length) != complement(copies[at : at + length])
+                wrong += read(offset, length) != complement(copies[at : at + length])
         return wrong
 
 
@@ -96,22 +91,22 @@ def complement(data: bytes) -> bytes:
     return data.translate(_COMPLEMENT)
 
 
-def gather(path: Path, out: McapWriter, start_unix_ns: int) -> None:
-    """Add the copies to a file that holds all but them, its digest and its index.
+def gather(path: Path, listed: Summary, start_unix_ns: int) -> Iterator[Attachment]:
+    """The copies of a file that holds all but them, its digest and its index.
 
     Parameters
     ----------
-    path, out : the file, and what writes it.
+    listed : its index, with Unix times.
     start_unix_ns : Unix time of stamp 0.
 
     Raises
     ------
-    SessionError : the file can not be read back. OSError : the disk refuses.
+    SessionError : the file can not be read back.
     """
     with contextlib.closing(open_bytes(path)) as source:
-        for name, ranges in _pieces(_ranges(out.summary())):
+        for name, ranges in _pieces(_ranges(listed)):
             data = b"".join(complement(source.read(offset, length)) for offset, length in ranges)
-            out.add(Attachment(start_unix_ns, start_unix_ns, name, _MEDIA_TYPE, data))
+            yield Attachment(start_unix_ns, start_unix_ns, name, _MEDIA_TYPE, data)
 
 
 def _ranges(listed: Summary) -> list[Range]:

@@ -222,7 +222,8 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
         if copier.draws:
             camera, start_unix_ns = ChipCamera.of(contents.header), contents.source.start_unix_ns
             draw(draft, out, camera, start_unix_ns, _left_out(contents), kept.outcome)
-        gather(draft, out, contents.source.start_unix_ns)
+        for copies in gather(draft, out.summary(), contents.source.start_unix_ns):
+            out.add(copies)
         out.add_digest()
         out.finish()
         out.sync()

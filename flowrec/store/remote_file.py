@@ -45,7 +45,7 @@ class _Opened:
 
     @property
     def known(self) -> tuple[Answer, ...]:
-        """What need not be asked for."""
+        """The bytes that need not be asked for."""
         return (self.tail,) if self.head is None else (self.tail, self.head)
 
 

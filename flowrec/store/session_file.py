@@ -352,7 +352,8 @@ class SessionFile:
             if self.partial_path.exists():  # else its folder was renamed: recovery draws
                 left_out = self._options.left_out_topics
                 draw(self.partial_path, self._file, camera, self._start_unix_ns, left_out, outcome)
-                gather(self.partial_path, self._file, self._start_unix_ns)
+                for copies in gather(self.partial_path, self._file.summary(), self._start_unix_ns):
+                    self._file.add(copies)
             self._file.add_digest()
             self._file.finish()
             self._file.sync()

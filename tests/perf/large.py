@@ -154,7 +154,8 @@ def _write(path: Path, load: Load, seconds_long: float, with_frames: bool) -> It
             out.add_chunks([builder.seal()])
             yield begin / load.rate_hz
         out.add(Metadata(OUTCOME, {"outcome": "goal reached"}))
-        gather(path, out, 0)
+        for copies in gather(path, out.summary(), 0):
+            out.add(copies)
         out.add_digest()
         out.finish()
         out.sync()
