@@ -14,6 +14,7 @@ from mcap.records import ChunkIndex, Metadata
 from flowrec.core import FIXED, Message, SessionError, TopicTable, printable, seconds
 from flowrec.store.channels import SessionContents
 from flowrec.store.digest import HEAD, channel_digest, head_digest, sum_text, topic_text
+from flowrec.store.gathered_copies import GatheredCopies
 from flowrec.store.mcap_format import Record
 from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
 from flowrec.store.roi import Region
@@ -216,6 +217,10 @@ def disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool
         apart = {index.offset for index in ours} ^ {index.offset for index in theirs}
         if apart:
             yield False, f"{len(apart)} {what} are only in the index, or only outside it"
+    if not contents.source.lookup_agrees():
+        yield True, "the lookup record, which is read at a URL, is not of this file"
+    if wrong := GatheredCopies(contents.source.read_summary()).wrong(contents.source.read):
+        yield True, f"{wrong} records have other copies at the end of the file, where they are read at a URL"
 
 
 def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:

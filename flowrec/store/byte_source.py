@@ -26,11 +26,14 @@ class LocalFile:
     ----------
     path : its name, for messages.
     size : number of bytes when it was opened.
+    is_far : a request for each range takes a round trip, so ranges next to each other are worth an effort.
 
     Raises
     ------
     SessionError : it can not be opened.
     """
+
+    is_far = False
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -78,7 +81,7 @@ class LocalFile:
                 data = os.read(self._descriptor, length)
         return data
 
-    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+    def prefetch(self, ranges: Iterable[tuple[int, int]], gap_bytes: int | None = None) -> None:
         """Ranges (offset, length) that will be read soon, each once: the operating system reads ahead by itself."""
 
     def close(self) -> None:

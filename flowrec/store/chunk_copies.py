@@ -20,6 +20,7 @@ from flowrec.core import BY_PATH, Applied, Message, Outcome, SessionError, Timin
 from flowrec.store.channels import SLOTS, VIEWED, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.gathered_copies import is_copy
 from flowrec.store.mcap_format import (
     CHUNK_HEAD,
     LONG,
@@ -187,7 +188,8 @@ class ChunkCopier:
             if record.name not in _ANEW:
                 out.add(Metadata(record.name, self._source.metadata(record)))
         for place in contents.attachments:
-            out.add(self._source.record(place.offset, place.length, Opcode.ATTACHMENT))
+            if not is_copy(place.name):
+                out.add(self._source.record(place.offset, place.length, Opcode.ATTACHMENT))
         for schema in contents.schemas.values():
             out.add(schema)
         for channel in contents.channels.values():

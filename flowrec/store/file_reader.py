@@ -8,7 +8,7 @@ import functools
 import heapq
 import itertools
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from operator import attrgetter
 from pathlib import Path
@@ -30,6 +30,7 @@ _LARGE_CHUNK_BYTES = 1 << 22
 _GROWTH = 2  # of an image that is decoded ahead; JPEG compresses more and is decoded when its turn comes
 # Decompressed before they are asked for. The number grows as they are read: who reads little fetches little.
 _AHEAD_BYTES, _AHEAD_CHUNKS, _AHEAD_AT_FIRST = 32 << 20, 48, 4
+_ANNOUNCED_BYTES = 16 << 20  # at a time, of what is wanted as a whole
 _THREADS = 2
 _THREAD_NAME = "session-reader"
 _FEW = 64  # messages of a chunk that may wait as objects
@@ -56,11 +57,13 @@ class FileReader(SessionContents):
         encoding = ENCODINGS.get(self.frame_encoding)
         self._lossless = encoding is None or encoding.lossless
 
-    def new_messages(self, start_ns: int | None, fields: Collection[str]) -> Iterator[tuple[int, NewMessages]]:
-        """Stamp and new messages of some topics of all ticks, or of those at and after `start_ns`."""
+    def new_messages(
+        self, start_ns: int | None, fields: Collection[str], end_ns: int | None = None
+    ) -> Iterator[tuple[int, NewMessages]]:
+        """Stamp and new messages of some topics of all ticks, or of those from `start_ns` to before `end_ns`."""
         sizes: dict[str, int] = {}
         read = dict.fromkeys(self._channels_of(fields), 0)
-        for stamp_ns, records in itertools.groupby(self._read(fields, start_ns or 0), key=_by_time):
+        for stamp_ns, records in itertools.groupby(self._read(fields, start_ns or 0, end_ns), key=_by_time):
             new: NewMessages = {}
             for record in records:
                 field = self.fields[record.channel]
@@ -68,28 +71,32 @@ class FileReader(SessionContents):
                 new[field] = self._message(record)
                 read[record.channel] += 1
             yield stamp_ns, new
-        for channel, count in read.items() if start_ns is None else ():
+        for channel, count in read.items() if start_ns is None and end_ns is None else ():
             announced = self.statistics.channel_message_counts.get(channel, 0)
             if count != announced:
                 path = self.channels[channel].topic
                 raise DamageError(self.source.path, f"{announced} messages of {path} are announced, {count} were read")
 
-    def announce(self, start_ns: int, fields: Collection[str]) -> None:
-        """Announce that the state before a time and then the messages from it on are read: one round trip for a URL."""
+    def announce(self, start_ns: int, fields: Collection[str], end_ns: int | None = None) -> None:
+        """Announce that the state before a time and then the messages from it on are read: one round trip for a URL.
+
+        All messages before `end_ns`, or only the first ones where it is not known.
+        """
         channels = self._channels_of(fields)
         before = _likely(self._chunks_until(start_ns - 1, channels), channels, start_ns - 1)
-        from_it = [sorted(chunks, key=_in_time)[:_AHEAD_AT_FIRST] for chunks in self._chunks_from(start_ns, channels)]
+        count = _AHEAD_AT_FIRST if end_ns is None else None
+        from_it = [sorted(chunks, key=_in_time)[:count] for chunks in self._chunks_from(start_ns, channels, end_ns)]
         self.source.prefetch(itertools.chain(before, *from_it))
 
     def messages(self, field: str) -> Iterator[tuple[int, Any]]:
         """All messages of one topic, each with the stamp of its tick."""
-        for record in self._read({field}):
+        for record in self._read({field}, whole=True):
             yield record.log_ns, self._message(record)
 
     def rows(self, fields: Collection[str]) -> Iterator[tuple[int, str, Row]]:
         """Stamp of the tick, field of Tick and row of plain values of each message of some topics but the images."""
         decoders = {channel: self.row_decoder(channel) for channel in self._channels_of(fields)}
-        for record in self._read(fields):
+        for record in self._read(fields, whole=True):
             try:
                 row = decoders[record.channel](record)
             except SessionError as error:
@@ -186,26 +193,32 @@ class FileReader(SessionContents):
             del self._cache[next(iter(self._cache))]
         return message
 
-    def _read(self, fields: Collection[str], start_ns: int = 0) -> Iterator[Record]:
-        """The messages of some topics from a time on, state and frames merged."""
+    def _read(
+        self, fields: Collection[str], start_ns: int = 0, end_ns: int | None = None, *, whole: bool = False
+    ) -> Iterator[Record]:
+        """The messages of some topics from a time to before another, state and frames merged; `whole`: all of them."""
         wanted = self._channels_of(fields)
-        state, frames = self._chunks_from(start_ns, wanted)
+        state, frames = self._chunks_from(start_ns, wanted, end_ns)
         with _threads() as executor:
             merged = (
-                _merge(self.source, state, executor),
+                _merge(self.source, state, executor, whole=whole),
                 _merge(self.source, frames, executor, self._decoded_frame),
             )
             for record in heapq.merge(*merged, key=_by_time):
+                if end_ns is not None and record.log_ns >= end_ns:
+                    return
                 if record.log_ns >= start_ns and record.channel in wanted:
                     yield record
 
-    def _chunks_from(self, start_ns: int, channels: set[int]) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
-        """Chunks of channels that end at or after a time: with anything but frames, and with frames only."""
+    def _chunks_from(
+        self, start_ns: int, channels: set[int], end_ns: int | None = None
+    ) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
+        """Chunks of channels with messages from a time to before another: of anything but frames, of frames only."""
         state: list[ChunkIndex] = []
         frames: list[ChunkIndex] = []
         largest_bytes = PIXELS_LIMIT * pixel_type(self.frame_bits).itemsize + _LARGE_CHUNK_BYTES
         for chunk in self._chunks_with(channels):
-            if chunk.message_end_time >= start_ns:
+            if chunk.message_end_time >= start_ns and (end_ns is None or chunk.message_start_time < end_ns):
                 only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
                 if only_frames and chunk.uncompressed_size > largest_bytes:
                     raise self.source.damage_error(chunk.chunk_start_offset, "images of more pixels than flowrec reads")
@@ -282,7 +295,12 @@ def _threads() -> Iterator[Executor]:
 
 
 def _merge(
-    source: McapReader, chunks: Iterable[ChunkIndex], executor: Executor, decode: _Decode | None = None
+    source: McapReader,
+    chunks: Iterable[ChunkIndex],
+    executor: Executor,
+    decode: _Decode | None = None,
+    *,
+    whole: bool = False,
 ) -> Iterator[Record]:
     """The messages of chunks in order of time; those of equal time stay in file order.
 
@@ -293,6 +311,7 @@ def _merge(
     ----------
     decode : what can be done with each record in the threads, where a chunk contains few and large ones: images. It
         returns the record with a message of at most twice its size as payload, or as it was.
+    whole : all chunks are wanted, so that they may be announced many at a time.
 
     Raises
     ------
@@ -301,6 +320,7 @@ def _merge(
     waiting = deque(_overlapping(source, sorted(chunks, key=_in_time)))
     running: deque[tuple[list[ChunkIndex], Future[list[_ChunkContent]]]] = deque()
     ahead_bytes, ahead = 0, _AHEAD_AT_FIRST
+    announced = _Announced(source, tuple(waiting), whole)
     while waiting or running:
         begun: list[list[ChunkIndex]] = []
         while waiting and len(running) + len(begun) < ahead:
@@ -309,7 +329,7 @@ def _merge(
                 break  # a bundle that is larger than all that may be ahead comes alone
             begun.append(waiting.popleft())
             ahead_bytes += nbytes
-        source.prefetch(chunk for bundle in begun for chunk in bundle)
+        announced.begin(len(begun))
         running.extend((bundle, executor.submit(_contents, source, bundle, decode)) for bundle in begun)
         ahead = min(ahead + 1, _AHEAD_CHUNKS)
         bundle, future = running.popleft()
@@ -319,6 +339,30 @@ def _merge(
         yield from records
         del records
         ahead_bytes -= _size(bundle)
+
+
+class _Announced:
+    """Announces bundles of chunks before they begin, in batches: few at first, more as they are read."""
+
+    def __init__(self, source: McapReader, bundles: Sequence[list[ChunkIndex]], whole: bool) -> None:
+        self._source, self._bundles, self._whole = source, bundles, whole
+        self._end = self._begun = 0
+        self._count = _AHEAD_AT_FIRST
+
+    def begin(self, count: int) -> None:
+        """So many more begin, long before they are read; the next batch is announced where the last one ends."""
+        self._begun += count
+        while self._end < min(self._begun, len(self._bundles)):
+            batch: list[ChunkIndex] = []
+            nbytes = 0
+            for bundle in self._bundles[self._end : None if self._whole else self._end + self._count]:
+                batch += bundle
+                nbytes += sum(chunk.chunk_length for chunk in bundle)
+                self._end += 1
+                if nbytes > _ANNOUNCED_BYTES:
+                    break
+            self._source.prefetch(batch)
+            self._count = min(max(self._count, self._end // 4), _AHEAD_CHUNKS)
 
 
 def _overlapping(source: McapReader, chunks: list[ChunkIndex]) -> Iterator[list[ChunkIndex]]:

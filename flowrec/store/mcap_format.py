@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import io
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -146,14 +146,14 @@ class Summary:
             chunk.message_end_time -= start_unix_ns
 
 
-def parse_summary(data: bytes, data_end: int) -> Summary:
-    """The summary from its bytes; what it lists lies before `data_end` in the file.
+def parse_summary(data: bytes, data_end: int, chunks: Sequence[ChunkIndex] = ()) -> Summary:
+    """The summary from its bytes, and chunks that these do not list; what it lists lies before `data_end` in the file.
 
     Raises
     ------
     ValueError, struct.error, mcap.exceptions.McapError : it is damaged, or contradicts itself or the file.
     """
-    summary = Summary()
+    summary = Summary(chunks=list(chunks))
     interned: dict[tuple[bytes, bytes], dict[int, int]] = {}
     listed_bytes = declared = 0
     for opcode, at, length in records_in(data):

@@ -32,6 +32,8 @@ from mcap.records import (
 
 from flowrec.core import MOVIE_FILES, SessionError
 from flowrec.store.byte_source import open_bytes
+from flowrec.store.gathered_copies import GatheredCopies, complement
+from flowrec.store.lookup_record import Piece, parse_lookup, place_of_lookup
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
     CHUNK_HEAD,
@@ -56,6 +58,8 @@ _FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
 _AT_ONCE_BYTES, _WINDOW_LIMIT_BYTES = 8 << 20, 8 << 20
 _HEADER_LIMIT_BYTES = 1 << 16
 _SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
+# What is read in vain between copies, and between images whose state has copies, instead of one more request.
+_COPIES_GAP_BYTES, _IMAGES_GAP_BYTES = 1 << 20, 256 << 10
 _SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
 _PARSED: dict[Opcode, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 _LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: 256 << 20}
@@ -68,6 +72,7 @@ _DAMAGE = (
     struct.error,
     ValueError,
     KeyError,
+    TypeError,
     IndexError,
     OverflowError,
     MemoryError,
@@ -116,7 +121,12 @@ class McapReader:
         self.start_unix_ns = 0
         self._bytes = open_bytes(path)
         self.size, self.close = self._bytes.size, self._bytes.close
+        self._summary: Summary | None = None  # that was read to find the copies
+        self._pieces: list[Piece] = []
+        self._copies: GatheredCopies | None = None
         try:
+            if self._bytes.is_far:
+                self._find_copies()
             self.header = self._read_header()
         except BaseException:
             self.close()
@@ -137,18 +147,46 @@ class McapReader:
         """Exactly that many bytes."""
         if not 0 <= offset <= offset + length <= self.size:
             raise self.damage_error(offset, f"{length} bytes are announced, the file ends at {self.size}")
-        data = self._bytes.read(offset, length)
+        for first, known in self._pieces:
+            if first <= offset and offset + length <= first + len(known):
+                return known[offset - first : offset - first + length]
+        copy = self._copies.place_of(offset, length) if self._copies is not None else None
+        data = self._bytes.read(offset if copy is None else copy, length)
         if len(data) < length:
             raise self.damage_error(offset, "the file has become shorter while it was read")
-        return data
+        return data if copy is None else complement(data)
+
+    def read_originals(self) -> None:
+        """Read every record where it stands from now on, none from its copy."""
+        self._copies, self._pieces = None, []
 
     def prefetch(self, chunks: Iterable[ChunkIndex], *, indexes: bool = False) -> None:
         """Announce that these chunks, or the indexes after them, will be read soon: one round trip for a URL."""
+        if not self._bytes.is_far:
+            return
         ends = ((chunk, chunk.chunk_start_offset + chunk.chunk_length) for chunk in chunks)
         if indexes:
-            self._bytes.prefetch([(end, chunk.message_index_length) for chunk, end in ends])
+            wanted = [(end, chunk.message_index_length) for chunk, end in ends]
         else:
-            self._bytes.prefetch([(chunk.chunk_start_offset, chunk.chunk_length) for chunk, _ in ends])
+            wanted = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk, _ in ends]
+        copies: list[tuple[int, int]] = []
+        elsewhere: list[tuple[int, int]] = []
+        for offset, length in wanted:
+            copy = self._copies.place_of(offset, length) if self._copies is not None else None
+            if copy is None:
+                elsewhere.append((offset, length))
+            else:
+                copies.append((copy, length))
+        self._bytes.prefetch(copies, _COPIES_GAP_BYTES)
+        self._bytes.prefetch(elsewhere, _IMAGES_GAP_BYTES if copies else None)
+
+    def _find_copies(self) -> None:
+        """Read what a file at a URL repeats at its end for those who read it there."""
+        with contextlib.suppress(DamageError, UnfinishedError):  # raised again where the index is wanted
+            footer, footer_at, tail = self._footer()
+            found = self._lookup(footer, footer_at)
+            self._summary, self._pieces = found or (self._long_summary(footer, footer_at, tail), [])
+            self._copies = GatheredCopies(self._summary)
 
     def damage_error(self, offset: int, why: object) -> DamageError:
         """The error for bytes that can not be parsed."""
@@ -164,6 +202,26 @@ class McapReader:
 
     def read_summary(self) -> Summary:
         """The summary section, checksum verified; nothing in it lies outside the file or over something else."""
+        if self._summary is not None:
+            found, self._summary = self._summary, None  # once, because who asks changes it
+            return found
+        return self._long_summary(*self._footer())
+
+    def lookup_agrees(self) -> bool:
+        """False if the lookup record repeats something else than what other programs read."""
+        footer, footer_at, tail = self._footer()
+        try:
+            found = self._lookup(footer, footer_at)
+        except DamageError:
+            return False
+        if found is None:
+            return True
+        short, pieces = found
+        same = all(self.read(offset, len(data)) == data for offset, data in pieces)
+        return same and short.chunks == self._long_summary(footer, footer_at, tail).chunks
+
+    def _footer(self) -> tuple[Footer, int, bytes]:
+        """The footer, its offset, and the bytes from there on."""
         tail = self.read(max(0, self.size - FOOTER_BYTES - len(MAGIC)), min(self.size, FOOTER_BYTES + len(MAGIC)))
         if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != FOOTER_BYTES + len(MAGIC):
             raise UnfinishedError(
@@ -175,6 +233,9 @@ class McapReader:
             footer = Footer.read(stream_of(tail[9:]))
         if footer.summary_start == 0:
             raise UnfinishedError(f"{self.path}: has no index; `flowrec recover {self.path}` makes one")
+        return footer, footer_at, tail
+
+    def _long_summary(self, footer: Footer, footer_at: int, tail: bytes) -> Summary:
         start = footer.summary_start
         if footer_at - start > _SUMMARY_LIMIT_BYTES:
             raise self.damage_error(start, f"an index of {footer_at - start} bytes, more than {_SUMMARY_LIMIT_BYTES}")
@@ -183,6 +244,20 @@ class McapReader:
             raise self.damage_error(start, "the checksum of the index is wrong")
         with self.parsing(start):
             return parse_summary(data, start)
+
+    def _lookup(self, footer: Footer, footer_at: int) -> tuple[Summary, list[Piece]] | None:
+        """Summary and records of the head, by the lookup record at the end of the file; None where there is none."""
+        offsets_at, begin = footer.summary_offset_start, footer.summary_start
+        if not 0 < offsets_at < footer_at < offsets_at + _SMALL_LIMIT_BYTES:
+            return None
+        with self.parsing(offsets_at):
+            place = place_of_lookup(self.read(offsets_at, footer_at - offsets_at), begin, footer_at)
+            if place is None:
+                return None
+            between_at, at, nbytes = place
+            between = self.read(between_at, at - between_at)
+            chunks, pieces = parse_lookup(self.read(at, nbytes)[RECORD_HEAD.size :], between, begin)
+            return parse_summary(between, begin, chunks), pieces
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""
@@ -306,12 +381,12 @@ class McapReader:
         if self.read(0, min(self.size, len(MAGIC))) != MAGIC:
             meant = _READ_BY.get(self.path.suffix.lower(), "flowrec reads what `flowrec record` has written")
             raise ForeignError(f"{self.path}: is not an MCAP file; {meant}")
-        data = self.read(len(MAGIC), min(self.size - len(MAGIC), _HEADER_LIMIT_BYTES))
+        at = len(MAGIC) + RECORD_HEAD.size
         with self.parsing(len(MAGIC)):
-            opcode, length = RECORD_HEAD.unpack_from(data)
-            if opcode != Opcode.HEADER or length > len(data) - RECORD_HEAD.size:
+            opcode, length = RECORD_HEAD.unpack(self.read(len(MAGIC), min(self.size - len(MAGIC), RECORD_HEAD.size)))
+            if opcode != Opcode.HEADER or length > min(self.size - at, _HEADER_LIMIT_BYTES):
                 raise ValueError("no header record")
-            header: Header = Header.read(stream_of(data[RECORD_HEAD.size :][:length]))
+            header: Header = Header.read(stream_of(self.read(at, length)))
         return header
 
     def body(self, offset: int, length: int, opcode: Opcode) -> memoryview:

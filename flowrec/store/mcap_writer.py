@@ -35,7 +35,16 @@ from mcap.records import (
 
 from flowrec.core import SessionError, open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
-from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary, parse_summary
+from flowrec.store.lookup_record import LOOKUP_OPCODE, SMALL_BYTES, Piece, lookup_record
+from flowrec.store.mcap_format import (
+    CHUNK_HEAD,
+    LONG,
+    MAGIC,
+    RECORD_HEAD,
+    SealedChunk,
+    Summary,
+    parse_summary,
+)
 
 _BUFFERS_PER_WRITE = 1024  # IOV_MAX of Linux
 
@@ -63,6 +72,7 @@ class McapWriter:
         self._counts: Counter[int] = Counter()
         self._digests: Counter[int] = Counter()
         self._head_digest = 0
+        self._pieces: list[Piece] = []  # small records outside the chunks
         self._first_ns = self._last_ns = 0
 
     def clear(self) -> None:
@@ -73,7 +83,9 @@ class McapWriter:
 
     def start(self, profile: str, library: str) -> None:
         """Write magic and header."""
-        self._append(MAGIC, _bytes_of(Header(profile=profile, library=library)))
+        head = MAGIC + _bytes_of(Header(profile=profile, library=library))
+        self._pieces.append((0, head))
+        self._append(head)
 
     def add(self, record: Metadata | Attachment | Schema | Channel) -> None:
         """Write a record outside the chunks."""
@@ -81,6 +93,8 @@ class McapWriter:
         self._summary.enter(record, self.size, len(data))
         if isinstance(record, Metadata | Attachment):
             self._head_digest += head_digest(record)
+            if len(data) <= SMALL_BYTES:
+                self._pieces.append((self.size, data))
         self._append(data)
 
     def add_digest(self) -> None:
@@ -136,6 +150,9 @@ class McapWriter:
             if group:
                 offsets += _bytes_of(SummaryOffset(opcode, start + len(summary), len(group)))
                 summary += group
+        lookup = lookup_record(self.summary().chunks, self._pieces, bytes(summary[len(self._chunks) :]))
+        offsets += _bytes_of(SummaryOffset(LOOKUP_OPCODE, start + len(summary), len(lookup)))
+        summary += lookup
         offset_start = start + len(summary)
         footer = _bytes_of(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0))
         # The checksum covers all of the summary up to itself, the last four bytes of the footer.
@@ -147,14 +164,14 @@ class McapWriter:
         return parse_summary(b"".join(group for _, group in self._groups()), self.size)
 
     def _groups(self) -> Iterator[tuple[Opcode, bytes | bytearray]]:
-        """The records of the summary by kind."""
+        """The records of the summary by kind; the longest one first, so that the others are at the end of the file."""
         listed = self._summary
         listed.count(self._counts, self._chunk_count, self._first_ns, self._last_ns)
         assert listed.statistics is not None
+        yield Opcode.CHUNK_INDEX, self._chunks
         yield Opcode.SCHEMA, _bytes_of(*listed.schemas.values())
         yield Opcode.CHANNEL, _bytes_of(*listed.channels.values())
         yield Opcode.STATISTICS, _bytes_of(listed.statistics)
-        yield Opcode.CHUNK_INDEX, self._chunks
         yield Opcode.ATTACHMENT_INDEX, _bytes_of(*listed.attachments)
         yield Opcode.METADATA_INDEX, _bytes_of(*listed.metadata)
 

@@ -30,6 +30,7 @@ _OK, _PARTIAL, _NO_RANGE, NOT_OFFERED = 200, 206, 416, 501  # statuses of HTTP
 _LATER = (408, 425, 429)  # a time limit, too early, too many requests
 _NOT_INSTALLED = "{}: reading from a URL needs a package; pip install 'flowrec[remote]'"
 _WHOLE_ONLY = "can not be read in ranges, the server sends whole files only; copy it to this machine"
+_PACKED = "can not be read: the server compresses ranges ({}), which was not asked for; switch that off for .mcap"
 _NO_RANGE_TOLD = "can not be read: the server answers 206 without a range"
 
 
@@ -184,7 +185,7 @@ class _Bucket(ObjectRequests):
                     error.size = obstore.head(self._store, self._key)["size"]
             raise
         if len(data) != end - begin:
-            raise TransientError(f"the server sent {len(data)} of {end - begin} bytes")
+            raise _too_few(len(data), end - begin, found.attributes.get("Content-Encoding", ""))
         return Answer(data, begin, meta["size"], _version(meta))
 
     def objects(self, begin: str) -> Iterator[ListedObject]:
@@ -313,16 +314,23 @@ def _answer(response: Any, first: int | None, length: int, end_s: float) -> Answ
         text = f"the server sent the bytes {begin} to {last} where {length} from {asked} were asked for"
         raise OtherRangeError(text, size)
     data = bytearray()
-    while piece := response.read1(_PIECE_BYTES):
+    while piece := response.read1(_PIECE_BYTES, decode_content=False):
         data += piece
         if time.monotonic() > end_s:
             raise TransientError("the server is too slow")
         if len(data) > expected:
             break
     if len(data) != expected:
-        raise TransientError(f"the server sent {len(data)} of {expected} bytes")
+        raise _too_few(len(data), expected, response.headers.get("Content-Encoding", ""))
     version = response.headers.get("ETag") or response.headers.get("Last-Modified") or ""
     return Answer(bytes(data), begin, size, version)
+
+
+def _too_few(count: int, expected: int, encoding: str) -> Exception:
+    """The error of an answer whose content has another length than its range."""
+    if encoding not in ("", "identity"):
+        return RefusedError(_PACKED.format(encoding))
+    return TransientError(f"the server sent {count} of {expected} bytes")
 
 
 def _redirect_target(url: str, target: str) -> str:

@@ -101,8 +101,10 @@ class SessionReader:
         """From the first tick to the last, in s."""
         return seconds(self.last_ns - self.first_ns)
 
-    def ticks(self, start_ns: int | None = None, *, with_frames: bool = True) -> Iterator[Tick]:
-        """All ticks, or those at and after `start_ns`, each with everything known by then.
+    def ticks(
+        self, start_ns: int | None = None, end_ns: int | None = None, *, with_frames: bool = True
+    ) -> Iterator[Tick]:
+        """All ticks, or those at and after `start_ns` and before `end_ns`, each with everything known by then.
 
         A message is new in a tick if it is another object than in the tick before. Where the recording had to
         drop an image, the tick still holds the previous one, so its frame is not new.
@@ -111,19 +113,22 @@ class SessionReader:
         ----------
         start_ns : the state before it is restored from the few chunks that hold it, so that starting late in a
             session gives exactly the tail of all ticks.
+        end_ns : at a URL, what is before it is asked for at once.
         with_frames : without, no image is read and `frame` is None; ticks in which nothing but a frame
             was new are left out.
         """
         wanted, tick = self._choose_fields(with_frames=with_frames), Tick()
         if start_ns is not None:
-            self.file(max(self._numbers_until(start_ns), default=0)).announce(start_ns, wanted)
+            self.file(max(self._numbers_until(start_ns), default=0)).announce(start_ns, wanted, end_ns)
             tick = self.tick_before(start_ns - 1, with_frames=with_frames)
         for number, file in enumerate(self._run.files):
             if start_ns is not None and file.last_ns < start_ns:
                 continue
+            if end_ns is not None and file.first_ns >= end_ns:
+                break
             # A file that is read from its beginning is compared with the counts in its index.
             late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
-            for stamp_ns, new in self.file(number).new_messages(late_ns, wanted):
+            for stamp_ns, new in self.file(number).new_messages(late_ns, wanted, end_ns):
                 if not number or stamp_ns > file.first_ns:
                     tick = self.topics.with_messages(tick, stamp_ns, new)
                     yield tick

@@ -23,6 +23,7 @@ from flowrec.core import (
 from flowrec.store.audit import disagreements, edits_of
 from flowrec.store.channels import SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
+from flowrec.store.gathered_copies import gather
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.mcap_writer import disk_errors, new_mcap
 from flowrec.store.reader import SessionReader
@@ -221,6 +222,8 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
         if copier.draws:
             camera, start_unix_ns = ChipCamera.of(contents.header), contents.source.start_unix_ns
             draw(draft, out, camera, start_unix_ns, _left_out(contents), kept.outcome)
+        for copies in gather(draft, out.summary(), contents.source.start_unix_ns):
+            out.add(copies)
         out.add_digest()
         out.finish()
         out.sync()

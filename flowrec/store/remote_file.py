@@ -1,8 +1,9 @@
 """Sessions at URLs as sources of bytes, with few requests, many at a time; and the objects of folders in buckets.
 
-Opening asks for the first and the last 256 KiB together: they hold head, index and outcome of most sessions. Both, and
-the rest of a longer index, are remembered for a while, because a session is opened several times in a row. What
-`prefetch` announces is fetched at once, a bounded number of bytes ahead. Each answer must be of the object that was
+Opening asks for the last 512 KiB, which hold the index of most sessions and a copy of their head (gathered_copies.py);
+files without copies are asked for the first 256 KiB, too. Both, and the rest of a longer index, are remembered for a
+while, because a session is opened several times in a row. What `prefetch` announces is fetched at once, a bounded
+number of bytes ahead; ranges near each other are one request. Each answer must be of the object that was
 opened. Nothing lists the files of an http server.
 """
 
@@ -24,9 +25,10 @@ from flowrec.store.object_requests import CONNECTIONS, Answer, ListedObject, Obj
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout_s
 
-_END_BYTES = 256 << 10
-_AHEAD_BYTES = 48 << 20
-_GAP_BYTES, _JOINED_BYTES = 64 << 10, 8 << 20
+_END_BYTES, _HEAD_BYTES = 512 << 10, 256 << 10
+_AHEAD_BYTES = 64 << 20
+_GAP_BYTES, _JOINED_BYTES = 64 << 10, 16 << 20
+_BLOCK_BYTES = 4 << 20  # for who reads on
 _NEAR_BYTES = 1 << 20  # what is read so near before the known end is fetched up to it
 _REMEMBERED, _REMEMBERED_S = 64, 60.0  # openings, and for how long they hold
 _TOGETHER = 8  # objects that are opened at a time
@@ -37,9 +39,14 @@ class _Opened:
     """An object as it was when it was opened."""
 
     requests: ObjectRequests
-    head: Answer
     tail: Answer
     until_s: float
+    head: Answer | None = None
+
+    @property
+    def known(self) -> tuple[Answer, ...]:
+        """The bytes that need not be asked for."""
+        return (self.tail,) if self.head is None else (self.tail, self.head)
 
 
 @dataclass(slots=True)
@@ -62,12 +69,15 @@ class RemoteFile:
     Attributes
     ----------
     version : the server's word for its content.
+    is_far : as of a LocalFile.
 
     Raises
     ------
     SessionError : the server does not answer, in one line; MissingError: it is not there, or access is refused.
     UsageError : the extra `remote` is not installed, or the time limit is no number.
     """
+
+    is_far = True
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -76,7 +86,7 @@ class RemoteFile:
         self._closer = weakref.finalize(self, self._threads.shutdown, wait=False, cancel_futures=True)
         self._ahead: list[_Ahead] = []
         self._block: Answer | None = None  # of a reader that goes through the file
-        self._last_end = 0
+        self._last_end = 1 << 63  # nothing was read
         self._lock = threading.Lock()
         try:
             self._object = self._open()
@@ -93,21 +103,25 @@ class RemoteFile:
         if end <= offset:
             return b""
         opened = self._object
-        answer = next((each for each in (opened.head, opened.tail) if _holds(each, offset, end)), None)
+        answer = next((each for each in opened.known if _holds(each, offset, end)), None)
         if answer is not None:
             pass
         elif (ahead := self._take_ahead(offset, end)) is not None:
             answer = ahead.result()
         elif end > opened.tail.first - _NEAR_BYTES and opened.tail.first - offset <= _JOINED_BYTES:
             answer = self._longer_tail(opened, offset)
+        elif end <= _HEAD_BYTES and opened.head is None:
+            answer = self._range(0, min(_HEAD_BYTES, opened.tail.first))
+            self._remember(opened, replace(opened, head=answer))
         else:
             answer = self._fetch_unannounced(offset, end)
         return answer.data[offset - answer.first : end - answer.first]
 
-    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Ask for ranges (offset, length) that will be read soon; those near each other are one request."""
+    def prefetch(self, ranges: Iterable[tuple[int, int]], gap_bytes: int | None = None) -> None:
+        """Ask for ranges (offset, length) that will be read soon; those with no larger gap between are one request."""
+        gap = _GAP_BYTES if gap_bytes is None else gap_bytes
         with self._lock:
-            known: list[Answer | _Ahead] = [self._object.head, self._object.tail, *self._ahead]
+            known: list[Answer | _Ahead] = [*self._object.known, *self._ahead]
             room = _AHEAD_BYTES - sum(each.end - each.first for each in self._ahead)
             joined: list[list[int]] = []
             for offset, length in sorted(ranges):
@@ -115,7 +129,7 @@ class RemoteFile:
                 if length > _JOINED_BYTES or any(_holds(each, offset, end) for each in known):
                     continue
                 last_one = joined[-1] if joined else None
-                if last_one and offset - last_one[1] <= _GAP_BYTES and end - last_one[0] <= _JOINED_BYTES:
+                if last_one and offset - last_one[1] <= gap and end - last_one[0] <= _JOINED_BYTES:
                     last_one[1], last_one[2] = max(last_one[1], end), last_one[2] + 1
                 else:
                     joined.append([offset, end, 1])
@@ -152,7 +166,7 @@ class RemoteFile:
             return block
         if not 0 <= offset - last_end <= _GAP_BYTES:
             return self._range(offset, end - offset)
-        block = self._range(offset, min(max(end - offset, _JOINED_BYTES // 2), self.size - offset))
+        block = self._range(offset, min(max(end - offset, _BLOCK_BYTES), self.size - offset))
         with self._lock:
             self._block = block
         return block
@@ -162,11 +176,14 @@ class RemoteFile:
         first = max(0, offset - _GAP_BYTES)
         more = self._range(first, opened.tail.first - first)
         longer = replace(opened.tail, data=more.data + opened.tail.data, first=first)
-        self._object = replace(opened, tail=longer)
-        with _remembering:
-            if _remembered.get(self._url) is opened:
-                _remembered[self._url] = self._object
+        self._remember(opened, replace(opened, tail=longer))
         return longer
+
+    def _remember(self, before: _Opened, opened: _Opened) -> None:
+        self._object = opened
+        with _remembering:
+            if _remembered.get(self._url) is before:
+                _remembered[self._url] = opened
 
     def _open(self) -> _Opened:
         with _remembering:
@@ -174,11 +191,7 @@ class RemoteFile:
         if known is not None and time.monotonic() < known.until_s:
             return known
         asked = requests_for(self._url, timeout_s())
-        begun = self._threads.submit(self._answer, asked, 0, _END_BYTES)
-        tail = self._answer(asked, None, _END_BYTES)
-        head = begun.result()
-        self._refuse_other(head, tail)
-        opened = _Opened(asked, head, tail, time.monotonic() + _REMEMBERED_S)
+        opened = _Opened(asked, self._answer(asked, None, _END_BYTES), time.monotonic() + _REMEMBERED_S)
         with _remembering:
             _remembered[self._url] = opened
             _remembered.move_to_end(self._url)

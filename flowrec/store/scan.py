@@ -17,6 +17,7 @@ from mcap.records import ChunkIndex
 
 from flowrec.core import SessionError
 from flowrec.store.digest import message_digest
+from flowrec.store.lookup_record import LOOKUP_OPCODE
 from flowrec.store.mcap_format import (
     CHUNK_HEAD,
     CHUNK_LIMIT_BYTES,
@@ -166,6 +167,7 @@ def scan(
     ------
     SessionError : the file can not be read.
     """
+    source.read_originals()
     found = Scan(source, visit, source.start_unix_ns if digests else None)
     at = len(MAGIC)
     # What looks like a chunk after damage may be none, and overlap the next one: the cost of trying is bounded.
@@ -206,7 +208,7 @@ def extent_of(source: McapReader, at: int) -> tuple[int, int]:
         return 0, 0
     opcode, length = RECORD_HEAD.unpack(source.read(at, RECORD_HEAD.size))
     end = at + RECORD_HEAD.size + length
-    known = Opcode.HEADER <= opcode <= Opcode.DATA_END
+    known = Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode == LOOKUP_OPCODE
     return (opcode, end) if known and end <= source.size else (0, 0)
 
 

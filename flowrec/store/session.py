@@ -175,14 +175,18 @@ class Session:
 
         return SessionReader(self.path, self.run)
 
-    def ticks(self, start_s: float | None = None, *, with_frames: bool = True) -> Iterator[Tick]:
-        """All ticks, or those at and after `start_s`, each with every message known by then.
+    def ticks(
+        self, start_s: float | None = None, end_s: float | None = None, *, with_frames: bool = True
+    ) -> Iterator[Tick]:
+        """All ticks, or those at and after `start_s` and before `end_s`, each with every message known by then.
 
         A message is new in a tick if it is another object than in the tick before. Without `with_frames` no image is
         read, and ticks with nothing but a new image are left out.
         """
         start_ns = None if start_s is None else self.stamp_ns(start_s)
-        return self.reader.ticks(start_ns, with_frames=with_frames)
+        whole = end_s is None or end_s > seconds(self.run.last_ns)
+        end_ns = None if whole or end_s is None else self.stamp_ns(end_s)
+        return self.reader.ticks(start_ns, end_ns, with_frames=with_frames)
 
     def at(self, time_s: float, *, with_frames: bool = True) -> Tick:
         """The tick at or before a time, with every message known by then.

@@ -29,6 +29,7 @@ from flowrec.core import (
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
+from flowrec.store.gathered_copies import gather
 from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.mcap_writer import FileError, disk_errors, new_mcap, not_writable
 from flowrec.store.roi import Region
@@ -351,6 +352,8 @@ class SessionFile:
             if self.partial_path.exists():  # else its folder was renamed: recovery draws
                 left_out = self._options.left_out_topics
                 draw(self.partial_path, self._file, camera, self._start_unix_ns, left_out, outcome)
+                for copies in gather(self.partial_path, self._file.summary(), self._start_unix_ns):
+                    self._file.add(copies)
             self._file.add_digest()
             self._file.finish()
             self._file.sync()

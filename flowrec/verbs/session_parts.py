@@ -16,7 +16,16 @@ from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 from flowrec.core import FIXED, Role, TopicTable, UsageError, printable, seconds
-from flowrec.store import FRAME_PATH, VERDICT, Session, SessionHeader, SessionMetadata, is_header_file, toml_table
+from flowrec.store import (
+    FRAME_PATH,
+    VERDICT,
+    Session,
+    SessionHeader,
+    SessionMetadata,
+    is_copy,
+    is_header_file,
+    toml_table,
+)
 
 HEAD = (
     *("configuration", "chip", "provenance", "parent", "outcome"),
@@ -110,7 +119,7 @@ class SessionParts(NamedTuple):
                     content = first.source.metadata(record)
                     items |= {f"records.{record.name}.{key}": text for key, text in content.items()}
             for place in first.attachments:
-                if not is_header_file(place.name):
+                if not is_header_file(place.name) and not is_copy(place.name):
                     items[f"records.{place.name}"] = first.source.attachment(place)
             declared = {}
             for channel in first.channels.values():

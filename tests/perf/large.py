@@ -5,6 +5,7 @@ The file is real but for the pixels, which are holes in it: nobody who asks for 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import struct
@@ -12,44 +13,35 @@ import subprocess
 import sys
 import tempfile
 import time
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 import numpy as np
 import typer
-import zstandard
+from mcap.records import Metadata
 
 from flowrec.bench.harness import Results, run
 from flowrec.core.terminal import progress, table
 from flowrec.core.topics import TOPICS
 from flowrec.core.units import NS_PER_S
-from flowrec.store.channels import FRAMES, SLOTS, STATE
-from tests.store.drafts import (
-    CHUNK,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
-    HEADER,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_INDEX,
-    Draft,
-    listing_of,
-    made_up,
-    record,
-    small_draft,
-    text,
-)
+from flowrec.store.channels import FRAME_PATH, SLOTS, declarations
+from flowrec.store.chunk import ChunkBuilder
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.gathered_copies import gather
+from flowrec.store.mcap_format import ChannelIndex, SealedChunk
+from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.session_metadata import OUTCOME, PROFILE, header_records
+from tests.perf.store_writers import made_up_header
+from tests.store.drafts import MESSAGE_INDEX, made_up, record
 from tests.store.made_up import encode
 
 _FLUSH_S = 0.5
 _FRAME_CHUNK_BYTES = 1 << 20
 _PER_TICK = ("applied", "track", "estimate", "demand", "currents", "timing", "truth")
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _START_NS = NS_PER_S
+_ZEROS = bytes(8 << 20)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,101 +113,66 @@ def write_sparse(path: Path, load: Load, gigabytes: float) -> None:
         pass
 
 
+class SparseWriter(McapWriter):
+    """Leaves holes where images are, which are all the same view of zeros."""
+
+    def _append(self, *buffers: bytes | memoryview) -> None:
+        for buffer in buffers:
+            if buffer.obj is _ZEROS if isinstance(buffer, memoryview) else False:
+                self.size += len(buffer)
+                self._file.seek(self.size)
+            else:
+                super()._append(buffer)
+
+
 def _write(path: Path, load: Load, seconds_long: float, with_frames: bool) -> Iterator[float]:
     """Write chunks as the writer does, without the pixels; yields the time written, s."""
-    draft: Draft = small_draft()
     rng = np.random.default_rng(0)
     payloads = {
-        topic.path: encode(made_up(topic.type, _START_NS, 0, rng)) for topic in TOPICS if topic.field in _PER_TICK
+        topic.path: encode(made_up(topic.type, _START_NS, 0, rng))  # type: ignore[no-untyped-call]
+        for topic in TOPICS
+        if topic.field in _PER_TICK
     }
     period_ns = round(NS_PER_S / load.rate_hz)
     per_flush = round(_FLUSH_S * load.rate_hz)
     per_frame_chunk = max(1, -(-_FRAME_CHUNK_BYTES // (load.width_px * load.height_px)))
-    listed: list[tuple[int, bytes]] = []
-    counts: dict[int, int] = {}
     ticks = int(seconds_long * load.rate_hz)
-    with path.open("wb") as file:
-        file.write(MAGIC + record(HEADER, text("flowrec") + text("flowrec perf large")))
-        for opcode, body in draft.head:
-            listed += listing_of(opcode, body, file.tell())
-            file.write(record(opcode, body))
+    with contextlib.closing(SparseWriter(path)) as out:
+        out.start(PROFILE, "flowrec perf large")
+        for part in (*header_records(made_up_header()), *declarations(ENCODINGS["raw"])):
+            out.add(part)
         for begin in range(0, ticks, per_flush):
             numbers = range(begin, min(begin + per_flush, ticks))
             for first in numbers[::per_frame_chunk] if with_frames else ():
                 some = range(first, min(first + per_frame_chunk, numbers.stop))
-                _add_frames(file, listed, counts, [_START_NS + number * period_ns for number in some], load)
-            _add_state(file, listed, counts, [_START_NS + number * period_ns for number in numbers], payloads)
+                out.add_chunks([_frames([_START_NS + number * period_ns for number in some], load)])
+            builder = ChunkBuilder()
+            for number in numbers:
+                stamp = _START_NS + number * period_ns
+                for topic, payload in payloads.items():
+                    builder.add(SLOTS[topic].channel, number, stamp, stamp, (payload,))
+            out.add_chunks([builder.seal()])
             yield begin / load.rate_hz
-        for opcode, body in draft.tail:
-            listed += listing_of(opcode, body, file.tell())
-            file.write(record(opcode, body))
-        _finish(file, draft, listed, counts, _START_NS + (ticks - 1) * period_ns)
-        os.fsync(file.fileno())
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # as if it had not just been written
+        out.add(Metadata(OUTCOME, {"outcome": "goal reached"}))
+        for copies in gather(path, out.summary(), 0):
+            out.add(copies)
+        out.add_digest()
+        out.finish()
+        out.sync()
+    descriptor = os.open(path, os.O_RDONLY)
+    os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)  # as if it had not just been written
+    os.close(descriptor)
 
 
-def _add_frames(
-    file: BinaryIO, listed: list[tuple[int, bytes]], counts: dict[int, int], stamps: list[int], load: Load
-) -> None:
-    channel = SLOTS["/camera/frame"].channel
-    assert SLOTS["/camera/frame"].group == FRAMES
-    each = _MESSAGE_HEAD.size + 40 + load.width_px * load.height_px
-    start, size = file.tell(), len(stamps) * each
-    head = struct.pack("<QQQI", stamps[0], stamps[-1], size, 0) + text("") + struct.pack("<Q", size)
-    file.write(struct.pack("<BQ", CHUNK, len(head) + size) + head)
-    file.seek(size, os.SEEK_CUR)
-    indexes = {channel: b"".join(struct.pack("<QQ", stamp, each * number) for number, stamp in enumerate(stamps))}
-    _index(file, listed, counts, start, stamps, indexes, "", size, size)
-
-
-def _add_state(
-    file: BinaryIO,
-    listed: list[tuple[int, bytes]],
-    counts: dict[int, int],
-    stamps: list[int],
-    payloads: dict[str, bytes],
-) -> None:
-    content = bytearray()
-    indexes: dict[int, bytes] = {}
-    for stamp in stamps:
-        for path, payload in payloads.items():
-            assert SLOTS[path].group == STATE
-            channel = SLOTS[path].channel
-            indexes[channel] = indexes.get(channel, b"") + struct.pack("<QQ", stamp, len(content))
-            content += _MESSAGE_HEAD.pack(MESSAGE, 22 + len(payload), channel, 0, stamp, stamp) + payload
-    packed = zstandard.ZstdCompressor(level=1).compress(bytes(content))
-    start = file.tell()
-    head = struct.pack("<QQQI", stamps[0], stamps[-1], len(content), zlib.crc32(content)) + text("zstd")
-    file.write(record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
-    _index(file, listed, counts, start, stamps, indexes, "zstd", len(packed), len(content))
-
-
-def _index(
-    file: BinaryIO,
-    listed: list[tuple[int, bytes]],
-    counts: dict[int, int],
-    start: int,
-    stamps: list[int],
-    indexes: dict[int, bytes],
-    compression: str,
-    packed: int,
-    size: int,
-) -> None:
-    length, offsets = file.tell() - start, b""
-    for channel, entries in indexes.items():
-        offsets += struct.pack("<HQ", channel, file.tell())
-        file.write(record(MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries))
-        counts[channel] = counts.get(channel, 0) + len(entries) // 16
-    place = struct.pack("<QQQQI", stamps[0], stamps[-1], start, length, len(offsets)) + offsets
-    place += struct.pack("<Q", file.tell() - start - length) + text(compression)
-    listed.append((CHUNK_INDEX, place + struct.pack("<QQ", packed, size)))
-
-
-def _finish(file: BinaryIO, draft: Draft, listed: list[tuple[int, bytes]], counts: dict[int, int], end: int) -> None:
-    file.write(record(DATA_END, struct.pack("<I", 0)))
-    start = file.tell()
-    file.write(b"".join(record(*part) for part in draft.index(listed, counts, [_START_NS, end])))
-    file.write(struct.pack("<BQQQI", FOOTER, 20, start, 0, 0) + MAGIC)
+def _frames(stamps: list[int], load: Load) -> SealedChunk:
+    """A chunk of images whose content is a hole."""
+    each = 31 + 40 + load.width_px * load.height_px  # head, what stands before the pixels, pixels
+    entries = b"".join(struct.pack("<QQ", stamp, each * number) for number, stamp in enumerate(stamps))
+    channel = SLOTS[FRAME_PATH].channel
+    index = record(MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
+    size = len(stamps) * each
+    indexes = [ChannelIndex(channel, len(stamps), 0, index)]
+    return SealedChunk("", memoryview(_ZEROS)[:size], stamps[0], stamps[-1], 0, size, indexes)
 
 
 def _measured(path: Path, what: str) -> dict[str, float]:

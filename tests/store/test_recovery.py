@@ -81,8 +81,8 @@ def same_ticks(one, other):
 
 
 def test_a_real_recording_cut_anywhere_is_replayed_exactly_after_recovery(session, tmp_path):
-    size = session.stat().st_size
     frames = SLOTS["/camera/frame"].channel
+    size = max(end for _, end, _ in chunks_of(session))  # what follows can be made again
     images_end = [end for _, end, channels in chunks_of(session) if channels == {frames}][5]
     for number, length in enumerate((int(0.15 * size), images_end, int(0.97 * size))):
         path = cut(session, length, tmp_path / f"cut{number}.mcap.partial")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import re
@@ -27,7 +28,7 @@ from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError, ask_repeat
 from flowrec.verbs.cli import app
 from tests.conftest import HANG_S, run
 from tests.extras import needs
-from tests.store.range_server import RangeServer, answer, served, some, status
+from tests.store.range_server import Fault, RangeServer, answer, served, some, status
 from tests.store.s3_server import BUCKET, KEYS, s3_server
 
 SESSION = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
@@ -156,6 +157,46 @@ def test_a_server_that_takes_the_last_bytes_for_the_first_is_asked_for_them_by_n
     url = server.url if scheme == "http" else f"s3://{BUCKET}/{session.name}"
     before = TRAFFIC.repeated
     assert flowrec.open(url).last.track.same_as(flowrec.open(session).last.track) and TRAFFIC.repeated == before
+
+
+def _unlabelled(to: BaseHTTPRequestHandler, first: int, last: int, _size: int) -> bool:
+    to.send_response(206)
+    to.send_header("Content-Length", str(last - first + 1))
+    to.end_headers()
+    to.wfile.write(bytes(last - first + 1))
+    return True
+
+
+def _compressed(to: BaseHTTPRequestHandler, first: int, last: int, size: int) -> bool:
+    body = gzip.compress(bytes(last - first + 1))
+    to.send_response(206)
+    to.send_header("Content-Length", str(len(body)))
+    to.send_header("Content-Range", f"bytes {first}-{last}/{size}")
+    to.send_header("Content-Encoding", "gzip")
+    to.end_headers()
+    to.wfile.write(body)
+    return True
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        (FAULTS["whole"][0], "can not be read in ranges, the server sends whole files only"),
+        (_unlabelled, "answers 206 without a range"),
+        (_compressed, "the server compresses ranges"),
+    ],
+)
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_a_store_that_answers_ranges_wrongly_is_refused_by_what_it_does_and_asked_once(
+    server: RangeServer, session: Path, monkeypatch: pytest.MonkeyPatch, scheme: str, fault: Fault, expected: str
+) -> None:
+    server.fault = fault
+    for name, value in {**KEYS, "AWS_ENDPOINT_URL": server.url.rpartition("/runs/")[0]}.items():
+        monkeypatch.setenv(name, value)
+    before = TRAFFIC.repeated
+    with pytest.raises(SessionError, match=expected):
+        flowrec.open(server.url if scheme == "http" else f"s3://{BUCKET}/{session.name}")
+    assert TRAFFIC.repeated == before
 
 
 def test_a_verb_says_which_requests_it_has_repeated(server: RangeServer, capsys: pytest.CaptureFixture[str]) -> None:
