@@ -81,6 +81,7 @@ from .setting_rows import (
 from .simulated_settings import (
     Optics as Optics, Simulated as Simulated, SimulatedImage as SimulatedImage,
 )
+from .stream_settings import LOG as LOG, STREAM_KINDS as STREAM_KINDS, StreamSettings as StreamSettings
 from .vision.learned import View as View
 from .vision.learning import (
     MOST as MOST, bodies_like as bodies_like, bodies_that_stand_out as bodies_that_stand_out,

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple, Protocol
 
 from flowrec.core import FIXED, Message, Methods, Source, Tick, Topic, TopicTable, UsageError
 
+from flowrec.stages.stream_settings import STREAM_TOPICS
+
 
 class ExtraStage(Protocol):
     """Stage that computes the messages of an extra topic of Source.STAGE."""
@@ -57,4 +59,6 @@ def extra_rows(config: Any) -> Iterator[ExtraRow]:
 
 def topics_of(config: Any) -> TopicTable:
     """The topics of a run; UsageError if two of one path are named."""
-    return TopicTable(row.topic for row in extra_rows(config)) if config.topics else FIXED
+    if not config.topics and not config.streams:
+        return FIXED
+    return TopicTable([*(STREAM_TOPICS if config.streams else ()), *(row.topic for row in extra_rows(config))])

@@ -12,10 +12,24 @@ from flowrec.core.messages.control import AxesCheck, Currents, Demand, Event, Mi
 from flowrec.core.messages.estimation import Estimate, Health, Observations
 from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, OperatorEvent, Truth, pixel_type
 from flowrec.core.messages.slow_stages import FlowField, Route
+from flowrec.core.messages.streams import (
+    EXPECTED,
+    HEARD,
+    SAMPLES,
+    SILENT,
+    STREAMS,
+    Samples,
+    StreamStates,
+)
 from flowrec.core.messages.vision import Appearance, Background, Shift, Track, shift_px
 
 __all__ = [
+    "EXPECTED",
+    "HEARD",
     "PIXEL_BITS",
+    "SAMPLES",
+    "SILENT",
+    "STREAMS",
     "Appearance",
     "Applied",
     "AxesCheck",
@@ -31,7 +45,9 @@ __all__ = [
     "Observations",
     "OperatorEvent",
     "Route",
+    "Samples",
     "Shift",
+    "StreamStates",
     "Track",
     "Truth",
     "pixel_type",
