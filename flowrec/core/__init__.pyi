@@ -39,7 +39,7 @@ from .messages import (
     Appearance as Appearance, Applied as Applied, AxesCheck as AxesCheck, Background as Background,
     Currents as Currents, Demand as Demand, Estimate as Estimate, Event as Event, FlowField as FlowField,
     Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
-    EXPECTED as EXPECTED, HEARD as HEARD, SAMPLES as SAMPLES, SILENT as SILENT, STREAMS as STREAMS,
+    BY_STREAM as BY_STREAM, EXPECTED as EXPECTED, HEARD as HEARD, SAMPLES as SAMPLES, SILENT as SILENT, STREAMS as STREAMS,
     Samples as Samples, StreamStates as StreamStates,
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,

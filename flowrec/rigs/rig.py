@@ -13,7 +13,7 @@ from typing import Protocol, Self, runtime_checkable
 import numpy as np
 
 from flowrec.core import Currents, Frame, Image, RigError, seconds
-from flowrec.rigs.streams.stream import Stream
+from flowrec.rigs.streams.stream import SampleStream
 from flowrec.stages import Inputs, StreamSettings
 
 _ROW_STEP = 16  # a camera's noise changes some pixel of these rows in every image
@@ -73,7 +73,7 @@ class Clocked(Protocol):
 class Measuring(Protocol):
     """A simulated rig, which has sensors of its own."""
 
-    def stream(self, name: str, settings: StreamSettings) -> Stream:
+    def stream(self, name: str, settings: StreamSettings) -> SampleStream:
         """The stream of a section [streams.NAME] of the kind `simulated`."""
 
 

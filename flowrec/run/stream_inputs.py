@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 
 from flowrec.core import (
+    BY_STREAM,
     EXPECTED,
     HEARD,
     NS_PER_S,
@@ -21,13 +22,14 @@ from flowrec.core import (
     SILENT,
     STREAMS,
     Action,
+    Floats,
     Message,
     Samples,
     StreamStates,
     UsageError,
     seconds,
 )
-from flowrec.rigs import Clocked, LogStream, Measuring, Rig, RunLog, Stream
+from flowrec.rigs import Clocked, LogStream, Measuring, Rig, RunLog, SampleStream
 from flowrec.run.control import RunControl
 from flowrec.run.stream_reader import StreamReader
 from flowrec.stages import STREAM_KINDS, Inputs, StreamSettings
@@ -58,6 +60,7 @@ class StreamInputs:
     tell : called with one line when a stream ends, comes back, or its clock steps.
     log : values of the program that records, for the streams of the kind `log`.
     realtime : the run keeps to the wall clock.
+    make : makes the stream of a section, as `stream_of` does.
 
     Raises
     ------
@@ -73,17 +76,21 @@ class StreamInputs:
         log: RunLog | None = None,
         *,
         realtime: bool,
+        make: Callable[..., SampleStream] | None = None,
     ) -> None:
         self._rig, self._control = rig, control
-        streams = {name: _stream_of(name, each, rig, realtime=realtime) for name, each in settings.items()}
+        streams = {name: (make or stream_of)(name, each, rig, realtime=realtime) for name, each in settings.items()}
         self._known = [
             _Known(StreamReader(name, stream, settings[name], tell), [], _needs_rig(settings[name]))
             for name, stream in streams.items()
         ]
         self._log = log
-        self._logged = {name: stream for name, stream in streams.items() if isinstance(stream, LogStream)}
+        self._logged: dict[str, LogStream] = {
+            name: stream for name, stream in streams.items() if isinstance(stream, LogStream)
+        }
         self._channels: list[str] = []
         self._units: list[str] = []
+        self._latest: Floats = np.zeros(0)
         self._stated_ns = -_STATED_NS
         self._stated: tuple[object, ...] = ()
 
@@ -141,7 +148,12 @@ class StreamInputs:
                 values.append(part.values)
         if not values:
             return None
-        return Samples(stamp_ns, np.concatenate(channel), np.concatenate(times), np.concatenate(values))
+        places, found = np.concatenate(channel), np.concatenate(values)
+        latest = np.full(len(self._channels), np.nan)
+        latest[: len(self._latest)] = self._latest
+        latest[places] = found  # of several values of a channel numpy keeps the last
+        self._latest = latest
+        return Samples(stamp_ns, places, np.concatenate(times), found, latest)
 
     def _name_channels(self, known: _Known) -> None:
         """Give a place to channels that are new; no channel ever changes its place."""
@@ -164,7 +176,7 @@ class StreamInputs:
             if not silent and quiet_s > 0.0:
                 continue  # nothing has come since
             each.state = SILENT if silent else HEARD
-            text = f"stream {reader.name} is {'silent' if silent else 'back'}"
+            text = f"{BY_STREAM}{reader.name} is {'silent' if silent else 'back'}"
             if silent and reader.settings.on_silence == "stop":
                 self._control.stop(text)
             elif silent and reader.settings.on_silence == "hold":
@@ -184,16 +196,18 @@ class StreamInputs:
             return None
         self._stated, self._stated_ns = key, stamp_ns
         counts = [each.reader.counts() for each in self._known]
-        whole = {name: np.array([getattr(count, name) for count in counts], np.int64) for name in _WHOLE}
-        floats = {name: np.array([getattr(count, name) for count in counts], np.float64) for name in _FLOATS}
+        made = {
+            name: np.array([getattr(count, name) for count in counts], kind)
+            for names, kind in ((_WHOLE, np.int64), (_FLOATS, np.float64))
+            for name in names
+        }
         return StreamStates(
             stamp_ns,
             "\n".join(each.reader.name for each in self._known),
             "\n".join(self._channels),
             "\n".join(self._units),
             np.array([each.state for each in self._known], np.int32),
-            **whole,
-            **floats,
+            **made,  # type: ignore[arg-type]
         )
 
 
@@ -205,7 +219,7 @@ def _needs_rig(settings: StreamSettings) -> bool:
     return "rig" in STREAM_KINDS[settings.kind].needs
 
 
-def _stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool) -> Stream:
+def stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool) -> SampleStream:
     """The stream of a section.
 
     Raises
@@ -221,5 +235,5 @@ def _stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool)
             f"streams.{name}.kind = {settings.kind!r}: samples of other programs come in real time; record with "
             "--realtime or the rig lab, or leave the section out"
         )
-    stream: Stream = STREAM_KINDS[settings.kind].load().of(name, settings)
+    stream: SampleStream = STREAM_KINDS[settings.kind].load().of(name, settings)
     return stream

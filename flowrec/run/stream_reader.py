@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import NS_PER_S, Floats, Ints, RigError, nanoseconds, seconds
-from flowrec.rigs import Chunk, NoStreamError, Stream, StreamHead
+from flowrec.rigs import Chunk, NoStreamError, SampleStream, StreamHead
 from flowrec.stages import StreamSettings
 
 _SLICE_S = 0.02  # longest wait for samples; a sample is that old at most when it is queued
@@ -63,7 +63,7 @@ class StreamReader:
     tell : called with one line when the stream ends, comes back, or its clock steps.
     """
 
-    def __init__(self, name: str, stream: Stream, settings: StreamSettings, tell: Callable[[str], None]) -> None:
+    def __init__(self, name: str, stream: SampleStream, settings: StreamSettings, tell: Callable[[str], None]) -> None:
         self.name, self.settings = name, settings
         self.head = StreamHead((), ())
         self._stream, self._tell = stream, tell
@@ -75,14 +75,11 @@ class StreamReader:
         self._thread: threading.Thread | None = None
         self._open = False
         self._refused = ""
-        self._forget_sender()
-
-    def _forget_sender(self) -> None:
-        self._shift_ns, self._last_ns, self._usual_ns, self._credit = 0, None, None, 0
-        self._shift_ns: int
-        self._last_ns: int | None
-        self._usual_ns: int | None
-        self._credit: int
+        # Of the present sender: the sum of the steps of its clock, its last stamp, the usual age of a sample on its
+        # arrival, and the missing samples that may still come.
+        self._shift_ns, self._credit = 0, 0
+        self._last_ns: int | None = None
+        self._usual_ns: int | None = None
 
     @property
     def silence_s(self) -> float:
@@ -172,11 +169,11 @@ class StreamReader:
                 if chunk is not None and len(chunk.times_ns):
                     self._accept(chunk)
             except NoStreamError as error:
-                self._gone(str(error))
+                self._lose_sender(str(error))
             except Exception as error:  # noqa: BLE001 - the code of others; it is told
-                self._gone(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}")
+                self._lose_sender(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}")
 
-    def _gone(self, why: str) -> None:
+    def _lose_sender(self, why: str) -> None:
         self._tell(f"streams.{self.name}: {why}; it is looked for again")
         self._stream.close()
         self._open = False
@@ -202,7 +199,7 @@ class StreamReader:
             self._closing.wait(_AGAIN_S)
             return False
         self._refused = ""
-        self._forget_sender()
+        self._shift_ns, self._credit, self._last_ns, self._usual_ns = 0, 0, None, None
         with self._changed:
             self.head, self._open = head, True
             self._set(gone=False, restarts=self._counts.restarts + 1)

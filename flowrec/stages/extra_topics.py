@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from flowrec.core import FIXED, Message, Methods, Source, Tick, Topic, TopicTable, UsageError
-
 from flowrec.stages.stream_settings import STREAM_TOPICS
 
 

@@ -1,4 +1,4 @@
-"""Settings of the streams of other programs: a section [streams.NAME] each; and the two topics that all of them share."""
+"""Settings of the streams of other programs, a section [streams.NAME] each; and the two topics that they share."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from typing import Annotated, Any, Literal
 from flowrec.core import SAMPLES, STREAMS, Method, Methods, Range, Samples, Source, StreamStates, Topic
 
 SIMULATED_STREAM, LOG = "simulated", "log"
-# Rows are rigs.streams.stream.Stream: `of(name, settings)` makes one. One that needs the rig comes from there.
+# Rows are rigs.streams.stream.SampleStream: `of(name, settings)` makes one. One that needs the rig comes from there.
 STREAM_KINDS = Methods(
     "streams.NAME.kind",
     Method("lsl", "flowrec.rigs.streams.lsl:LslStream", "an outlet of the Lab Streaming Layer", extra="streams"),
     Method(LOG, "flowrec.rigs.streams.log:LogStream", "what a program of Python gives to flowrec.RunLog.log"),
     Method(
-        SIMULATED_STREAM, "flowrec.rigs.simulated.pump_sensor:PumpSensor", "a flow sensor at the simulated pump", needs=("rig",)
+        SIMULATED_STREAM,
+        "flowrec.rigs.simulated.pump_sensor:PumpSensor",
+        "a flow sensor at the simulated pump",
+        needs=("rig",),
     ),
     group="flowrec.streams",
     verb="of",
@@ -41,5 +44,7 @@ class StreamSettings:
     on_silence: Literal["note", "hold", "stop"] = "note"
     # time in which the stream has to be found before the run; with on_silence = note the run begins without it
     wait_s: Annotated[float, Range(0.1, 600.0)] = 5.0
-    queue_samples: Annotated[int, Range(1, 10_000_000)] = 100_000  # that may wait for the loop; the oldest are lost first
+    queue_samples: Annotated[int, Range(1, 10_000_000)] = (
+        100_000  # that may wait for the loop; the oldest are lost first
+    )
     device: dict[str, Any] = field(default_factory=dict)  # settings of a kind of another package

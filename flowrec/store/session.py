@@ -35,6 +35,8 @@ from flowrec.store.session_path import session_path
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
+
+    from flowrec.store.stream_samples import Channel
     import xarray
     from numpy.typing import NDArray
 
@@ -201,6 +203,12 @@ class Session:
     def messages(self, field: str) -> Iterator[Any]:
         """All messages of one topic, named by its field of `Tick` or its path; SessionError if there is none."""
         return self.reader.messages(field)
+
+    def stream(self, channel: str) -> Channel:
+        """Samples of a channel of a stream, such as "pump/flow": `time_s`, `value`, `unit`; SessionError if none."""
+        from flowrec.store.stream_samples import channel_of
+
+        return channel_of(self.reader, channel)
 
     def table(self, topic: str) -> pa.Table:
         """All messages of one topic as an Arrow table, one row a message; `.to_pandas()` makes a DataFrame of it.

@@ -8,7 +8,17 @@ import typer
 
 from flowrec.core import View
 from flowrec.verbs.command import MisuseError, Told, verb
-from flowrec.verbs.options import AS_THE_COMMAND, ATTENDED, OF_A_CALL, AsConfig, Asked, Overwrite, SessionOut, Sets, readable_toml
+from flowrec.verbs.options import (
+    AS_THE_COMMAND,
+    ATTENDED,
+    OF_A_CALL,
+    AsConfig,
+    Asked,
+    Overwrite,
+    SessionOut,
+    Sets,
+    readable_toml,
+)
 
 if TYPE_CHECKING:
     from flowrec.rigs import RunLog

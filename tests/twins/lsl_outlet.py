@@ -1,7 +1,7 @@
 """An outlet of the Lab Streaming Layer in a process of its own: a twin of a pump's program.
 
-Each channel of sample n holds n plus the number of the channel. Commands are lines on stdin: `step S` steps the clock of
-its stamps by S seconds, `hold S` sends nothing for S seconds. At the end of stdin it ends.
+Each channel of sample n holds n plus the number of the channel. Commands are lines on stdin: `step S` steps the clock
+of its stamps by S seconds, `hold S` sends nothing for S seconds. At the end of stdin it ends.
 """
 
 from __future__ import annotations
@@ -14,6 +14,13 @@ import time
 
 import numpy as np
 import pylsl
+
+
+def take_commands(commands: queue.Queue[str]) -> None:
+    """Take the lines of stdin, and its end."""
+    for line in sys.stdin:
+        commands.put(line)
+    commands.put("end")
 
 
 def main() -> None:
@@ -31,7 +38,7 @@ def main() -> None:
     info.set_channel_units([asked.unit] * asked.channels)
     outlet = pylsl.StreamOutlet(info, max_buffered=60)
     commands: queue.Queue[str] = queue.Queue()
-    threading.Thread(target=lambda: [commands.put(line) for line in (*sys.stdin, "end")], daemon=True).start()
+    threading.Thread(target=take_commands, args=(commands,), daemon=True).start()
     print("ready", flush=True)
     sent, step_s, held_s = 0, 0.0, 0.0
     began_s = pylsl.local_clock()

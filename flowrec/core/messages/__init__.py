@@ -13,6 +13,7 @@ from flowrec.core.messages.estimation import Estimate, Health, Observations
 from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, OperatorEvent, Truth, pixel_type
 from flowrec.core.messages.slow_stages import FlowField, Route
 from flowrec.core.messages.streams import (
+    BY_STREAM,
     EXPECTED,
     HEARD,
     SAMPLES,
@@ -24,6 +25,7 @@ from flowrec.core.messages.streams import (
 from flowrec.core.messages.vision import Appearance, Background, Shift, Track, shift_px
 
 __all__ = [
+    "BY_STREAM",
     "EXPECTED",
     "HEARD",
     "PIXEL_BITS",

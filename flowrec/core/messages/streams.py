@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from flowrec.core.declarations import Matrix, Message, Shape, Vector
 
 SAMPLES, STREAMS = "/streams/samples", "/streams/state"  # paths of the topics
+BY_STREAM = "stream "  # the text of an operator's event that a stream has caused begins so
 EXPECTED, HEARD, SILENT = 0, 1, 2  # of StreamStates.state
 
 
@@ -28,6 +29,9 @@ class Samples(Message):
     ]
     sample_ns: Annotated[NDArray[np.int64], "array", Shape("n"), "when it was taken, on the session clock"]
     value: Annotated[Matrix, Shape("n", finite=False), "in the unit of the channel"]
+    latest: Annotated[
+        Vector, Shape("m", finite=False), "latest value of each channel so far, for plots; NaN before the first"
+    ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +51,9 @@ class StreamStates(Message):
     steps: Annotated[NDArray[np.int64], "array", Shape("s"), "steps of the sender's clock that were taken out, so far"]
     restarts: Annotated[NDArray[np.int64], "array", Shape("s"), "how often the stream has come back, so far"]
     correction_s: Annotated[
-        Vector, Shape("s", finite=False), "added to the sender's stamps: its clock to that of this machine; NaN: unknown"
+        Vector,
+        Shape("s", finite=False),
+        "added to the sender's stamps, to have them on the clock of this machine; NaN: unknown",
     ]
     age_s: Annotated[Vector, Shape("s", finite=False), "mean time from sample to arrival since the message before"]
     jitter_s: Annotated[Vector, Shape("s", finite=False), "standard deviation of that time"]

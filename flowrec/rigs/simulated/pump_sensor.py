@@ -18,7 +18,7 @@ from flowrec.rigs.streams.stream import Chunk, StreamHead
 
 
 class PumpSensor:
-    """See rigs.streams.stream.Stream.
+    """See rigs.streams.stream.SampleStream.
 
     Parameters
     ----------

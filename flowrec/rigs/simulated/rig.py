@@ -35,7 +35,7 @@ from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
 from flowrec.rigs.simulated.pump_sensor import PumpSensor
 from flowrec.rigs.simulated.world import Shake, TrueCoils, World, misregister, true_pump, true_robot, world_of
-from flowrec.rigs.streams.stream import Stream
+from flowrec.rigs.streams.stream import SampleStream
 from flowrec.stages import (
     Coils,
     FieldCommand,
@@ -175,7 +175,7 @@ class SimulatedRig:
         self._cut = False
         self.epoch_ns: int | None = None
 
-    def stream(self, name: str, settings: StreamSettings) -> Stream:
+    def stream(self, name: str, settings: StreamSettings) -> SampleStream:
         """The flow sensor at its pump; see rigs.rig.Measuring."""
         sensor = self._simulated.sensor
         return PumpSensor(

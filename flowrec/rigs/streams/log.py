@@ -66,7 +66,7 @@ class RunLog:
 
 
 class LogStream:
-    """The values of a RunLog for one section [streams.NAME]; see rigs.streams.stream.Stream."""
+    """The values of a RunLog for one section [streams.NAME]; see rigs.streams.stream.SampleStream."""
 
     polled = True
 

@@ -8,7 +8,9 @@ silently: the reader looks for it again, and refuses two.
 from __future__ import annotations
 
 import math
+import os
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -22,6 +24,7 @@ try:
 except (ImportError, RuntimeError, OSError) as error:  # without the package, or without the library that it brings
     raise ModuleNotFoundError(str(error), name="pylsl") from error
 
+_CONFIGURED = (Path("lsl_api.cfg"), Path("~/lsl_api/lsl_api.cfg"), Path("/etc/lsl_api/lsl_api.cfg"))
 _FIND_S = 1.0  # all outlets of a name answer within this time, so that two are seen
 _OPEN_S = 1.0  # for the connection, and for the first time correction
 _BUFFER_S = 60  # of the layer's own buffer, while the reader does not read
@@ -29,8 +32,17 @@ _MOST = 4096  # samples a call
 _CORRECTED_S = 1.0  # between two looks at the time correction; the layer measures it every few seconds
 
 
+def _keep_quiet() -> None:
+    """Let the layer print errors only, unless a person has configured it; before its first call."""
+    if "LSLAPICFG" not in os.environ and not any(path.expanduser().exists() for path in _CONFIGURED):
+        pylsl.set_config_content("[log]\nlevel = -2\n")
+
+
+_keep_quiet()
+
+
 class LslStream:
-    """An outlet by name, or by a query. See rigs.streams.stream.Stream."""
+    """An outlet by name, or by a query. See rigs.streams.stream.SampleStream."""
 
     polled = False
 
@@ -50,7 +62,7 @@ class LslStream:
         found = self._find()
         info = found[0]
         if info.channel_format() == pylsl.cf_string:
-            raise RigError(f"{_told(info)} sends texts, where numbers are wanted; name another outlet")
+            raise RigError(f"{_outlet_text(info)} sends texts, where numbers are wanted; name another outlet")
         self._inlet = inlet = pylsl.StreamInlet(info, max_buflen=_BUFFER_S, recover=False)
         try:
             full = inlet.info(_OPEN_S)
@@ -58,7 +70,7 @@ class LslStream:
             self._correction_s = inlet.time_correction(_OPEN_S)
         except (LostError, TimeoutError) as error:
             self.close()
-            raise NoStreamError(f"{_told(info)} does not answer") from error
+            raise NoStreamError(f"{_outlet_text(info)} does not answer") from error
         self._note_clock()
         count = full.channel_count()
         units = [unit or "" for unit in full.get_channel_units() or [""] * count]
@@ -68,7 +80,7 @@ class LslStream:
             named_channels(self._settings, stated, count),
             (unit,) * count if unit else tuple(units if len(units) == count else [""] * count),
             full.nominal_srate(),
-            _told(full),
+            _outlet_text(full),
         )
 
     def _find(self) -> list[pylsl.StreamInfo]:
@@ -90,7 +102,7 @@ class LslStream:
         if not found:
             raise NoStreamError(f"no outlet of the Lab Streaming Layer with {wanted}; start its program")
         if len(found) > 1:
-            listed = "; ".join(sorted(map(_told, found)))
+            listed = "; ".join(sorted(map(_outlet_text, found)))
             raise RigError(f"{len(found)} outlets with {wanted}: {listed}; end one, or set `query` to tell them apart")
         return found
 
@@ -125,7 +137,7 @@ class LslStream:
             self._inlet = None
 
 
-def _told(info: pylsl.StreamInfo) -> str:
+def _outlet_text(info: pylsl.StreamInfo) -> str:
     """An outlet in words, enough to tell two apart."""
     source = info.source_id() or f"uid {info.uid()[:8]}"
     return f"{info.name()!r} of {info.hostname()} ({source}, {info.channel_count()} channels)"

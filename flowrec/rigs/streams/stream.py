@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,7 @@ class Chunk:
     head: StreamHead | None = None
 
 
-class Stream(Protocol):
+class SampleStream(Protocol):
     """One stream. All methods are called in one thread at a time; `open` again after `close` looks for it anew.
 
     `of(name, settings)` of a row's class in STREAM_KINDS makes one of a section [streams.NAME]; nothing is touched
@@ -71,10 +71,6 @@ class Stream(Protocol):
     """
 
     polled: ClassVar[bool] = False
-
-    @classmethod
-    def of(cls, name: str, settings: StreamSettings) -> Self:
-        """The stream of a section."""
 
     def open(self) -> StreamHead:
         """Find the sender and connect; takes two seconds at most.
@@ -94,7 +90,7 @@ class Stream(Protocol):
         """
 
     def correction_s(self) -> float:
-        """What has been added to the sender's stamps, in s, to have them on this machine's clock; NaN: not known."""
+        """Correction that has been added to the sender's stamps, in s, to have them on this machine's clock; NaN: not known."""
         return math.nan
 
     def close(self) -> None:
