@@ -78,7 +78,8 @@ class StreamInputs:
         realtime: bool,
         make: Callable[..., SampleStream] | None = None,
     ) -> None:
-        self._rig, self._control = rig, control
+        self._clocked = rig if isinstance(rig, Clocked) else None
+        self._control = control
         streams = {name: (make or stream_of)(name, each, rig, realtime=realtime) for name, each in settings.items()}
         self._known = [
             _Known(StreamReader(name, stream, settings[name], tell), [], _needs_rig(settings[name]))
@@ -131,7 +132,7 @@ class StreamInputs:
             yield replace(inputs, extra={**inputs.extra, **new}) if new else inputs
 
     def _samples(self, stamp_ns: int) -> Samples | None:
-        epoch_ns = self._rig.epoch_ns if isinstance(self._rig, Clocked) else None
+        epoch_ns = (self._clocked.epoch_ns if self._clocked is not None else None) or 0
         channel, times, values = [], [], []
         for each in self._known:
             each.heard_ns = stamp_ns if each.heard_ns is None else each.heard_ns
@@ -144,7 +145,7 @@ class StreamInputs:
             places = np.array(each.places, np.int32)
             for part in taken:
                 channel.append(places[part.channel])
-                times.append(part.times_ns - (0 if each.own_clock else epoch_ns or 0))
+                times.append(part.times_ns - (0 if each.own_clock else epoch_ns))
                 values.append(part.values)
         if not values:
             return None

@@ -24,7 +24,8 @@ from flowrec.core import NS_PER_S, Floats, Ints, RigError, nanoseconds, seconds
 from flowrec.rigs import Chunk, NoStreamError, SampleStream, StreamHead
 from flowrec.stages import StreamSettings
 
-_SLICE_S = 0.02  # longest wait for samples; a sample is that old at most when it is queued
+_SLICE_S = 0.02  # longest wait for samples
+_GATHER_S = 0.01  # samples that come within this time are taken together, so that few turns are taken from the loop
 _AGAIN_S = 0.5  # between two looks for a sender that has ended
 _JOIN_S = 1.5
 _STEP_NS = NS_PER_S // 10
@@ -168,6 +169,7 @@ class StreamReader:
                 chunk = self._stream.read(_SLICE_S)
                 if chunk is not None and len(chunk.times_ns):
                     self._accept(chunk)
+                    self._closing.wait(_GATHER_S)
             except NoStreamError as error:
                 self._lose_sender(str(error))
             except Exception as error:  # noqa: BLE001 - the code of others; it is told

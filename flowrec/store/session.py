@@ -35,8 +35,6 @@ from flowrec.store.session_path import session_path
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
-
-    from flowrec.store.stream_samples import Channel
     import xarray
     from numpy.typing import NDArray
 
@@ -44,6 +42,7 @@ if TYPE_CHECKING:
     from flowrec.physics import Calibration, Chip
     from flowrec.stages import ResolvedConfig
     from flowrec.store.reader import Frames, SessionReader
+    from flowrec.store.stream_samples import Channel
     from flowrec.store.tables import Tables
 
 _CARD_PX = 240  # width of the picture of a card

@@ -39,7 +39,7 @@ def outlet(name: str, *words: str) -> Iterator[subprocess.Popen[str]]:
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
     try:
-        assert child.stdout is not None and child.stdout.readline() == "ready\n"
+        assert child.stdout is not None and child.stdout.readline().startswith("ready")
         yield child
     finally:
         child.kill()

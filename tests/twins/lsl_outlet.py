@@ -39,9 +39,9 @@ def main() -> None:
     outlet = pylsl.StreamOutlet(info, max_buffered=60)
     commands: queue.Queue[str] = queue.Queue()
     threading.Thread(target=take_commands, args=(commands,), daemon=True).start()
-    print("ready", flush=True)
     sent, step_s, held_s = 0, 0.0, 0.0
     began_s = pylsl.local_clock()
+    print("ready", repr(began_s), flush=True)
     while True:
         try:
             word, _, value = commands.get_nowait().partition(" ")
@@ -58,7 +58,7 @@ def main() -> None:
         due = int((pylsl.local_clock() - began_s - held_s) * asked.rate)
         if due > sent:
             numbers = np.arange(sent, due)
-            values = (numbers[:, None] + np.arange(asked.channels)).astype(asked.format)
+            values = (numbers[:, None] + np.arange(asked.channels)).astype(asked.format.replace("double64", "float64"))
             stamps = began_s + held_s + (numbers + 1) / asked.rate + step_s
             outlet.push_chunk(values, stamps)
             sent = due

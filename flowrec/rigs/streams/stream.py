@@ -90,7 +90,7 @@ class SampleStream(Protocol):
         """
 
     def correction_s(self) -> float:
-        """Correction that has been added to the sender's stamps, in s, to have them on this machine's clock; NaN: not known."""
+        """Correction added to the stamps of the sender, in s, to have them on this machine's clock; NaN: unknown."""
         return math.nan
 
     def close(self) -> None:
