@@ -40,7 +40,7 @@ from .messages import (
     Currents as Currents, Demand as Demand, Estimate as Estimate, Event as Event, FlowField as FlowField,
     Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
     BY_STREAM as BY_STREAM, EXPECTED as EXPECTED, HEARD as HEARD, SAMPLES as SAMPLES, SILENT as SILENT, STREAMS as STREAMS,
-    Samples as Samples, StreamStates as StreamStates,
+    PUMP as PUMP, PumpShare as PumpShare, Samples as Samples, StreamStates as StreamStates,
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )

@@ -23,6 +23,7 @@ from .estimation.consistency_monitor import HealthMonitor as HealthMonitor
 from .estimation.kalman import Kalman as Kalman, memory_s as memory_s
 from .estimation.luenberger import Luenberger as Luenberger
 from .estimation.observer import OBSERVERS as OBSERVERS, Observer as Observer
+from .estimation.pump import as_planned as as_planned
 from .estimation.sampler import SAMPLERS as SAMPLERS, Trimmed as Trimmed
 from .estimation.smoother import observe as observe, smooth as smooth
 from .estimation.whitening import (

@@ -40,6 +40,7 @@ from flowrec.physics import CHIP_KEYS, Calibration, Chip, ChipSettings, FlowSolv
 from flowrec.stages.control import Coils, Controller
 from flowrec.stages.control.mission import MissionStateMachine, PlacedMission
 from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
+from flowrec.stages.estimation.pump import PumpFollower
 from flowrec.stages.extra_topics import TOPIC_ROWS
 from flowrec.stages.outside_settings import extend_config, key_of_section, our_class, sections
 from flowrec.stages.planning import PLANNERS, Planner, SurveyPlanner
@@ -132,6 +133,7 @@ class Config:
     observer: Observer = field(default_factory=Observer)
     health: HealthMonitor = field(default_factory=HealthMonitor)
     sampler: Sampler = field(default_factory=Sampler)
+    pump: PumpFollower = field(default_factory=PumpFollower)
     flow: FlowSolver = field(default_factory=FlowSolver)
     refine: Refiner = field(default_factory=Refiner)
     survey: SurveyPlanner = field(default_factory=SurveyPlanner)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from flowrec.core import FIXED, Message, Methods, Source, Tick, Topic, TopicTable, UsageError
-from flowrec.stages.stream_settings import STREAM_TOPICS
+from flowrec.stages.stream_settings import PUMP_TOPIC, STREAM_TOPICS
 
 
 class ExtraStage(Protocol):
@@ -60,4 +60,5 @@ def topics_of(config: Any) -> TopicTable:
     """The topics of a run; UsageError if two of one path are named."""
     if not config.topics and not config.streams:
         return FIXED
-    return TopicTable([*(STREAM_TOPICS if config.streams else ()), *(row.topic for row in extra_rows(config))])
+    ours = [*(STREAM_TOPICS if config.streams else ()), *([PUMP_TOPIC] if config.pump.channel else [])]
+    return TopicTable([*ours, *(row.topic for row in extra_rows(config))])

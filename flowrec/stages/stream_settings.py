@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from flowrec.core import SAMPLES, STREAMS, Method, Methods, Range, Samples, Source, StreamStates, Topic
+from flowrec.core import PUMP, SAMPLES, STREAMS, Method, Methods, PumpShare, Range, Samples, Source, StreamStates, Topic
 
 SIMULATED_STREAM, LOG = "simulated", "log"
 # Rows are rigs.streams.stream.SampleStream: `of(name, settings)` makes one. One that needs the rig comes from there.
@@ -26,6 +26,7 @@ STREAM_TOPICS = (
     Topic(SAMPLES, Source.RIG, type=Samples),
     Topic(STREAMS, Source.RIG, type=StreamStates),
 )
+PUMP_TOPIC = Topic(PUMP, Source.STAGE, 1e-6, type=PumpShare)
 
 
 @dataclass(frozen=True, slots=True)

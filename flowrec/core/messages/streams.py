@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flowrec.core.declarations import Matrix, Message, Shape, Vector
 
-SAMPLES, STREAMS = "/streams/samples", "/streams/state"  # paths of the topics
+SAMPLES, STREAMS, PUMP = "/streams/samples", "/streams/state", "/flow/pump"  # paths of the topics
 BY_STREAM = "stream "  # the text of an operator's event that a stream has caused begins so
 EXPECTED, HEARD, SILENT = 0, 1, 2  # of StreamStates.state
 
@@ -65,3 +65,14 @@ class StreamStates(Message):
     def stream_names(self) -> list[str]:
         """The streams, in the order of the arrays."""
         return self.streams.split("\n")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PumpShare(Message):
+    """The pump's measured flow over the one at which the inlets have the speeds that the chip states."""
+
+    stamp_ns: int
+    share: Annotated[float, "now, as far as it has been measured"]
+    slow_share: Annotated[float, "a mean over some seconds, with which routes are planned"]
+    observed_share: Annotated[float, "a mean over the time of which an observation of the flow is a mean"]
+    sample_ns: Annotated[int, "time that the latest sample tells of, on the session clock"]
