@@ -13,6 +13,7 @@ from .rig import (
 from .streams.log import LogStream as LogStream, RunLog as RunLog
 from .streams.stream import (
     Chunk as Chunk, NoStreamError as NoStreamError, SampleStream as SampleStream, StreamHead as StreamHead,
+    settings_of_device as settings_of_device,
 )
 from .simulated.rig import SimulatedRig as SimulatedRig, true_view as true_view
 from .simulated.world import true_depth_um as true_depth_um, true_robot as true_robot

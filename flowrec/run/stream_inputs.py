@@ -29,7 +29,7 @@ from flowrec.core import (
     UsageError,
     seconds,
 )
-from flowrec.rigs import Clocked, LogStream, Measuring, Rig, RunLog, SampleStream
+from flowrec.rigs import Clocked, LogStream, Measuring, Rig, RunLog, SampleStream, settings_of_device
 from flowrec.run.control import RunControl
 from flowrec.run.stream_reader import StreamReader
 from flowrec.stages import STREAM_KINDS, Inputs, StreamSettings
@@ -236,5 +236,11 @@ def stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool) 
             f"streams.{name}.kind = {settings.kind!r}: samples of other programs come in real time; record with "
             "--realtime or the rig lab, or leave the section out"
         )
-    stream: SampleStream = STREAM_KINDS[settings.kind].load().of(name, settings)
+    row = STREAM_KINDS[settings.kind]
+    if row.source is not None:
+        device = settings_of_device(row.settings, settings.device, f"streams.{name}.device")
+        settings = replace(settings, device=device)
+    elif settings.device:
+        raise UsageError(f"streams.{name}.device: the kind {settings.kind!r} has no settings of its own; leave it out")
+    stream: SampleStream = row.load().of(name, settings)
     return stream

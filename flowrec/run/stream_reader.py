@@ -26,6 +26,7 @@ from flowrec.stages import StreamSettings
 
 _SLICE_S = 0.02  # longest wait for samples
 _GATHER_S = 0.01  # samples that come within this time are taken together, so that few turns are taken from the loop
+_DRAIN_S = 0.2  # longest time for samples from before the run to be thrown away
 _AGAIN_S = 0.5  # between two looks for a sender that has ended
 _JOIN_S = 1.5
 _STEP_NS = NS_PER_S // 10
@@ -117,7 +118,8 @@ class StreamReader:
     def start(self) -> None:
         """Begin to queue what comes from now on."""
         if self._open and not self._stream.polled:
-            while self._stream.read(0.0) is not None:
+            end_s = time.monotonic() + _DRAIN_S
+            while self._stream.read(0.0) is not None and time.monotonic() < end_s:
                 pass  # of the time before the run
         if not self._stream.polled:
             self._thread = threading.Thread(target=self._read, name=f"stream {self.name}", daemon=True)
@@ -162,6 +164,7 @@ class StreamReader:
         self._counts = replace(self._counts, **changes)  # type: ignore[arg-type]
 
     def _read(self) -> None:
+        gathered_s = -math.inf
         while not self._closing.is_set():
             try:
                 if not self._open and not self._reopen():
@@ -169,7 +172,8 @@ class StreamReader:
                 chunk = self._stream.read(_SLICE_S)
                 if chunk is not None and len(chunk.times_ns):
                     self._accept(chunk)
-                    self._closing.wait(_GATHER_S)
+                    self._closing.wait(max(0.0, gathered_s + _GATHER_S - time.monotonic()))
+                    gathered_s = time.monotonic()
             except NoStreamError as error:
                 self._lose_sender(str(error))
             except Exception as error:  # noqa: BLE001 - the code of others; it is told

@@ -1,4 +1,4 @@
-"""The flow of a map follows a measured pump: by the right factor, at the right time, and only where that is the flow."""
+"""The flow of a map follows a measured pump: by the right factor, at the right time, only where that is the flow."""
 
 from __future__ import annotations
 
@@ -33,7 +33,11 @@ def channel(*values: float) -> Chip:
 def flown(pump: PumpFollower, measured: list[float]) -> list[PumpShare | None]:
     """The share at each tick, with one sample a tick, taken at the tick."""
     states = StreamStates(
-        0, "pump", "pump/other\npump/flow", "\nul/min", *(np.ones(1, np.int32), *(np.zeros(1, np.int64),) * 5),
+        0,
+        "pump",
+        "pump/other\npump/flow",
+        "\nul/min",
+        *(np.ones(1, np.int32), *(np.zeros(1, np.int64),) * 5),
         *(np.zeros(1),) * 3,
     )
     last, shares = Tick(), list[PumpShare | None]()
