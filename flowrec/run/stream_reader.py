@@ -44,7 +44,7 @@ class Taken(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StreamCounts:
-    """What is known of a stream at a moment; see core.messages.streams.StreamStates."""
+    """Counts of a stream at a moment; see core.messages.streams.StreamStates."""
 
     samples: int = 0
     lost: int = 0

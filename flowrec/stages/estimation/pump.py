@@ -80,7 +80,7 @@ class PumpFollower:
         """The share of this tick; None before the first sample. Of a stream that is silent the last value stays."""
         if not self.channel:
             return None
-        known, previous = self._measured(last, tick), last.extra.get(PUMP)
+        known, previous = self._measurement(last, tick), last.extra.get(PUMP)
         if not isinstance(previous, PumpShare):
             return None if known is None else PumpShare(tick.stamp_ns, *(known[1][-1],) * 3, int(known[0][-1]))
         share, sample_ns = previous.share, previous.sample_ns
@@ -94,7 +94,7 @@ class PumpFollower:
         observed = previous.observed_share + (share - previous.observed_share) * _weight(dt_s, filter_s)
         return PumpShare(tick.stamp_ns, float(share), float(slow), float(observed), sample_ns)
 
-    def _measured(self, last: Tick, tick: Tick) -> tuple[np.ndarray, np.ndarray] | None:
+    def _measurement(self, last: Tick, tick: Tick) -> tuple[np.ndarray, np.ndarray] | None:
         """Times and values, over the nominal one, of the samples of this tick; None without any."""
         samples, states = tick.extra.get(SAMPLES), tick.extra.get(STREAMS)
         if not isinstance(samples, Samples) or not isinstance(states, StreamStates):
@@ -136,7 +136,7 @@ def _filter_s(last: Tick) -> float:
 
 
 @functools.lru_cache(maxsize=2)
-def scaled(flow: FlowField, share: float) -> FlowField:
+def at_share(flow: FlowField, share: float) -> FlowField:
     """A flow at a share of its speed everywhere."""
     share32 = np.float32(share)
     return replace(
@@ -149,7 +149,7 @@ def scaled(flow: FlowField, share: float) -> FlowField:
 
 def at_pump(flow: FlowField | None, pump: PumpShare | None) -> FlowField | None:
     """A map as the pump drives it now."""
-    return flow if flow is None or pump is None else scaled(flow, pump.share)
+    return flow if flow is None or pump is None else at_share(flow, pump.share)
 
 
 def as_planned(tick: Tick) -> Tick:
@@ -158,6 +158,6 @@ def as_planned(tick: Tick) -> Tick:
     if not isinstance(pump, PumpShare):
         return tick
     assumed, refined = (
-        None if each is None else scaled(each, pump.slow_share) for each in (tick.assumed, tick.refined)
+        None if each is None else at_share(each, pump.slow_share) for each in (tick.assumed, tick.refined)
     )
     return replace(tick, assumed=assumed, refined=refined)

@@ -14,7 +14,7 @@ from flowrec.core.units import NS_PER_S
 from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.chip.fluid import PowerLaw
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.estimation.pump import PumpFollower, as_planned, scaled
+from flowrec.stages.estimation.pump import PumpFollower, as_planned, at_share
 
 STEP_S = 0.04
 
@@ -81,7 +81,7 @@ def test_the_time_that_a_sample_tells_of_lies_the_delay_before_it() -> None:
 def test_a_scaled_field_is_that_of_the_scaled_boundary_values() -> None:
     chip, solver = channel(), FlowSolver(convection=False)
     faster = replace(chip, openings=tuple(replace(each, value=1.3 * each.value) for each in chip.openings))
-    of_share, solved = scaled(solver.solve(chip), 1.3), solver.solve(faster)
+    of_share, solved = at_share(solver.solve(chip), 1.3), solver.solve(faster)
     assert of_share.velocity_um_s == pytest.approx(solved.velocity_um_s, rel=1e-5, abs=1e-3)
     assert of_share.pressure_pa == pytest.approx(solved.pressure_pa, rel=1e-5, abs=1e-7)
 
