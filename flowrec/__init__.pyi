@@ -1,6 +1,7 @@
 __version__: str
 
 from .core.errors import FlowrecError as FlowrecError
+from .rigs.streams.log import RunLog as RunLog
 from .run.replay_figures import before_after as before_after
 from .stages.config import Config as Config
 from .stages.config import load_config as load_config

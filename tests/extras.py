@@ -17,6 +17,7 @@ EXTRA_OF = {
     "nidaqmx": "ni",
     "ompl": "ompl",
     "playwright": "dev",
+    "pylsl": "streams",
     "pymmcore_plus": "mmcore",
     "pypylon": "pylon",
     "skfmm": "dev",

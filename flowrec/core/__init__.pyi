@@ -4,7 +4,7 @@ from .clocks.clock_monitor import (
 )
 from .clocks.device_clock import DeviceClock as DeviceClock, Fit as Fit, envelope as envelope
 from .config_tree import (
-    IMAGE_SIZE as IMAGE_SIZE, Origin as Origin, REGISTRATION as REGISTRATION, apply_sets as apply_sets,
+    IMAGE_SIZE as IMAGE_SIZE, NAME as NAME, Origin as Origin, REGISTRATION as REGISTRATION, apply_sets as apply_sets,
     nearest_settings as nearest_settings, place_paths as place_paths, refuse_unknown as refuse_unknown, settings_of as settings_of,
     take_registration as take_registration, type_error as type_error, without_none as without_none,
 )
@@ -39,6 +39,8 @@ from .messages import (
     Appearance as Appearance, Applied as Applied, Measured as Measured, AxesCheck as AxesCheck, Background as Background,
     Currents as Currents, Demand as Demand, Estimate as Estimate, Event as Event, FlowField as FlowField,
     Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
+    BY_STREAM as BY_STREAM, EXPECTED as EXPECTED, HEARD as HEARD, SAMPLES as SAMPLES, SILENT as SILENT, STREAMS as STREAMS,
+    PUMP as PUMP, PumpShare as PumpShare, Samples as Samples, StreamStates as StreamStates,
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )
@@ -54,6 +56,7 @@ from .provenance import PACKAGE as PACKAGE, provenance as provenance, user_name 
 from .ranges import (
     Fault as Fault, OneOf as OneOf, PositiveShare as PositiveShare, Range as Range, Seed as Seed, Share as Share,
     Threads as Threads, Weight as Weight, check_ranges as check_ranges, faults as faults, hints as hints,
+    named_section as named_section,
     range_of as range_of,
 )
 from .summary import (

@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from flowrec.core.errors import UsageError
 from flowrec.core.methods import Methods, nearest_of
-from flowrec.core.ranges import Fault, hints, range_of
+from flowrec.core.ranges import Fault, hints, named_section, range_of
 from flowrec.core.system.toml_file import parse_toml, read_toml
 
 REGISTRATION = "camera.registration"
@@ -31,6 +31,8 @@ FILES = (
 )
 IMAGE_SIZE = ("width_px", "height_px")
 _SHOWN = 40  # characters of a value
+NAME = "NAME"  # of a section that a person names, where settings are listed
+_NAME_LIMIT = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,9 +161,10 @@ def place_paths(tree: dict[str, Any], file: Path) -> None:
 def type_error(root: type, key: str, value: Any, complaint: str) -> str:
     """The error text for a value of the wrong type, with the nearest valid value."""
     known = dict(_all_hints(root))
-    while key not in known and "." in key:  # a place in a tuple
-        key = key.rpartition(".")[0]
-    hint = known.get(key)
+    declared = _as_declared(root, key)
+    while declared not in known and "." in declared:  # a place in a tuple
+        key, declared = key.rpartition(".")[0], declared.rpartition(".")[0]
+    hint = known.get(declared)
     names, valid = _names_of(hint), range_of(hint)
     if names:
         return f"{key} = {value!r}: must be one of {', '.join(names)}{nearest_of(value, names)}"
@@ -172,6 +175,13 @@ def type_error(root: type, key: str, value: Any, complaint: str) -> str:
     if isinstance(value, str) and valid is not None:
         return f"{key} = {value!r}: is no number; one {valid} is wanted, without its unit"
     return f"{key} = {value!r}: {complaint}" + (f"; a number {valid} is wanted" if valid is not None else "")
+
+
+def _as_declared(root: type, key: str) -> str:
+    """A key with NAME in place of the name that a person has given to a section."""
+    first, _, rest = key.partition(".")
+    name, dot, last = rest.partition(".")
+    return f"{first}.{NAME}{dot}{last}" if name and named_section(hints(root).get(first)) is not None else key
 
 
 def _names_of(hint: Any) -> list[str]:
@@ -196,7 +206,9 @@ def refuse_unknown(
     for key, value in tree.items():
         name = prefix + key
         if key not in known:
-            near = nearest_settings(name, [each for each, _ in _all_hints(root)])
+            given = name.split(".")[1] if _as_declared(root, name) != name else NAME
+            near = nearest_settings(_as_declared(root, name), [each for each, _ in _all_hints(root)])
+            near = [each.replace(f".{NAME}.", f".{given}.") for each in near]
             all_of = (
                 f"known here: {', '.join(prefix + each for each in known)}" if prefix else "flowrec settings lists all"
             )
@@ -207,6 +219,22 @@ def refuse_unknown(
             if not isinstance(value, dict):
                 raise UsageError(f"{origin(name)}: {name} is a section, not a value; set one of its keys")
             refuse_unknown(value, root, origin, inner, f"{name}.")
+        elif (named := named_section(inner)) is not None:
+            _refuse_unnamed(value, root, origin, named, name)
+
+
+def _refuse_unnamed(value: Any, root: type, origin: Origin, kind: type, key: str) -> None:
+    """Raise UsageError if the sections below a key are no sections of this kind, each with a name."""
+    if not isinstance(value, dict):
+        raise UsageError(f"{origin(key)}: {key} is no value; write a section [{key}.{NAME}] for each")
+    for name, section in value.items():
+        if not (isinstance(name, str) and name.isascii() and name.isidentifier() and len(name) <= _NAME_LIMIT):
+            raise UsageError(
+                f"{origin(key)}: {key}.{str(name)[:_SHOWN]}: name it with letters, digits and _, as in {key}.pump"
+            )
+        if not isinstance(section, dict):
+            raise UsageError(f"{origin(key)}: {key}.{name} is a section with settings, not a value")
+        refuse_unknown(section, root, origin, kind, f"{key}.{name}.")
 
 
 def nearest_settings(name: str, keys: Sequence[str]) -> list[str]:
@@ -221,6 +249,8 @@ def _all_hints(section: type, prefix: str = "") -> Iterable[tuple[str, Any]]:
         yield prefix + key, inner
         if is_dataclass(inner) and isinstance(inner, type):
             yield from _all_hints(inner, f"{prefix}{key}.")
+        elif (named := named_section(inner)) is not None:
+            yield from _all_hints(named, f"{prefix}{key}.{NAME}.")
 
 
 def without_none(value: Any) -> Any:

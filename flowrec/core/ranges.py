@@ -9,7 +9,7 @@ import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from flowrec.core.errors import UsageError
 
@@ -87,6 +87,10 @@ def faults(settings: Any, prefix: str = "") -> Iterator[Fault]:
         if is_dataclass(value):
             yield from faults(value, f"{prefix}{key}.")
             continue
+        if named_section(hint) is not None:
+            for name, inner in value.items():
+                yield from faults(inner, f"{prefix}{key}.{name}.")
+            continue
         valid = range_of(hint)
         if valid is not None:
             yield from (Fault(prefix + key, number, valid) for number in _numbers(value) if number not in valid)
@@ -104,6 +108,12 @@ def hints(section: type) -> dict[str, Any]:
     """The annotations of a dataclass's fields by name."""
     found = get_type_hints(section, include_extras=True)
     return {field.name: found[field.name] for field in fields(section)}
+
+
+def named_section(hint: Any) -> Any:
+    """The settings class of sections that a person names, such as [streams.NAME]: a `dict[str, X]`; None for others."""
+    kind = get_args(hint)[1] if get_origin(hint) is dict else None
+    return kind if is_dataclass(kind) else None
 
 
 def range_of(hint: Any) -> Range | None:

@@ -7,9 +7,9 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowrec.core import JSON, M_PER_UM, MM_PER_UM, RBL, Output
-from flowrec.store import LENGTHS, Session, SessionMetadata, files_behind
-from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, peak, plot_of
+from flowrec.core import JSON, M_PER_UM, MM_PER_UM, RBL, SAMPLES, Output
+from flowrec.store import LENGTHS, Session, SessionMetadata, files_behind, units_of
+from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, peak, plot_of, stream_plots
 
 _CAMERA = "/view/camera"
 _LACKS = (
@@ -55,11 +55,12 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
     )
     foxglove.check()
     rerun.check()
-    plots = {
-        topic.path: plot
+    plots = [
+        plot
         for topic in session.reader.topics.extra
-        if (plot := plot_of(topic, next(session.messages(topic.path), None))) is not None
-    }
+        if topic.path != SAMPLES and (plot := plot_of(topic, next(session.messages(topic.path), None))) is not None
+    ]
+    plots += stream_plots(units_of(session.reader))
     with SessionMetadata(session.run.files[0].path) as head:
         counts, began_ns = head.statistics.channel_message_counts, head.source.start_unix_ns
         present = {head.channels[number].topic for number, count in counts.items() if count}
@@ -69,8 +70,8 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
     (width, height), (x, y) = ([scale * (um - less) for um in session.chip.size_um] for less in (0.0, px_um))
     refined = session.fields.get("refined")
     top_um_s = peak(refined) if refined is not None else None
-    layout = foxglove_layout((0.5 * x, 0.5 * y), max(width, height), list(plots.values()), unit, top_um_s)
-    extra = [(schemas[path], plot) for path, plot in plots.items() if path in present]
+    layout = foxglove_layout((0.5 * x, 0.5 * y), max(width, height), plots, unit, top_um_s)
+    extra = [(schemas[plot.topic], plot) for plot in plots if plot.topic in present]
     blueprint = bare_blueprint(present, began_ns + session.run.first_ns, began_ns + session.run.last_ns, extra)
     with foxglove.new_file() as part:
         part.write_text(json.dumps(layout, indent=1) + "\n", encoding="utf-8")

@@ -22,7 +22,7 @@ import pyarrow.parquet
 
 from flowrec.core import SessionError, __version__, seconds, summary_of
 from flowrec.exports.formats import TimeProgress
-from flowrec.store import Session, field_values, observed_flow
+from flowrec.store import Session, field_values, has_streams, observed_flow, sample_batches, sample_schema
 
 _RUN = "^[=+\\-@\t\r'＝＋－＠]"  # what a text begins with that a spreadsheet may take for a formula
 _LEVEL = 1  # of zstd: a quarter of the time of level 3 for a tenth more bytes
@@ -72,6 +72,12 @@ class _Tables:
                 for batch in table.to_batches():
                     writer.write_batch(batch)
             resources.append(_resource(name + self.suffix, table.schema, meaning))
+        if has_streams(session.reader):
+            name, schema = "stream_samples" + self.suffix, sample_schema()
+            with self.open_writer(part / name, schema) as writer:
+                for batch in sample_batches(session.reader):
+                    writer.write_batch(self.select(batch))
+            resources.append(_resource(name, schema, "the samples of the streams of other programs, a row each"))
         _write_datapackage(part, session, resources, self.remark)
 
 

@@ -7,8 +7,13 @@ from .movie.exported import session_of_log as session_of_log, with_exported as w
 from .movie.rig import MovieRig as MovieRig, fitted_to_movie as fitted_to_movie
 from .movie.source import MovieSource as MovieSource, open_source as open_source, sha256_of as sha256_of
 from .rig import (
-    Connecting as Connecting, Picturing as Picturing, Rig as Rig, Tried as Tried, checked_images as checked_images,
+    Clocked as Clocked, Connecting as Connecting, Measuring as Measuring, Picturing as Picturing, Rig as Rig, Tried as Tried, checked_images as checked_images,
     increasing_stamps as increasing_stamps,
+)
+from .streams.log import LogStream as LogStream, RunLog as RunLog
+from .streams.stream import (
+    Chunk as Chunk, NoStreamError as NoStreamError, SampleStream as SampleStream, StreamHead as StreamHead,
+    settings_of_device as settings_of_device,
 )
 from .simulated.rig import SimulatedRig as SimulatedRig, true_view as true_view
 from .simulated.world import true_depth_um as true_depth_um, true_robot as true_robot

@@ -13,7 +13,8 @@ from typing import Protocol, Self, runtime_checkable
 import numpy as np
 
 from flowrec.core import Currents, Frame, Image, RigError, seconds
-from flowrec.stages import Inputs
+from flowrec.rigs.streams.stream import SampleStream
+from flowrec.stages import Inputs, StreamSettings
 
 _ROW_STEP = 16  # a camera's noise changes some pixel of these rows in every image
 _REJECTED_LIMIT = 50  # frames in a row, then the robot is out of control
@@ -59,6 +60,21 @@ class Connecting(Protocol):
         ------
         RigError, UsageError : on entering; one line says which device is missing, busy or not as configured.
         """
+
+
+@runtime_checkable
+class Clocked(Protocol):
+    """A rig in real time: its stamps count from a moment of the host's monotonic clock."""
+
+    epoch_ns: int | None  # that moment; None before the first frame, and where the rig does not keep to a clock
+
+
+@runtime_checkable
+class Measuring(Protocol):
+    """A simulated rig, which has sensors of its own."""
+
+    def stream(self, name: str, settings: StreamSettings) -> SampleStream:
+        """The stream of a section [streams.NAME] of the kind `simulated`."""
 
 
 @runtime_checkable

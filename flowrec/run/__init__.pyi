@@ -2,7 +2,7 @@ import sys
 
 from .control import RunControl as RunControl
 from .disk_monitor import DiskMonitor as DiskMonitor, refuse_below as refuse_below
-from .loop import RunReport as RunReport, Sink as Sink, run as run
+from .loop import Joining as Joining, RunReport as RunReport, Sink as Sink, run as run
 from .operator_commands import (
     COMMANDS as COMMANDS, GOAL as GOAL, HELP as HELP, LONGEST_NOTE as LONGEST_NOTE, NOTE as NOTE, SPEED as SPEED,
     obey as obey,
@@ -13,6 +13,7 @@ from .replay_figures import (
     CommandDifference as CommandDifference, ReplayFiles as ReplayFiles, ReplayPair as ReplayPair,
     before_after as before_after,
 )
+from .stream_inputs import StreamInputs as StreamInputs
 from .streams import Streams as Streams
 from .watchdog import Watchdog as Watchdog
 from .worker_process import ProcessWorker as ProcessWorker

@@ -27,13 +27,23 @@ from flowrec.core import (
 )
 from flowrec.rigs import Rig, checked_images, increasing_stamps
 from flowrec.run.control import RunControl
-from flowrec.run.streams import Streams
 from flowrec.run.watchdog import Watchdog
 from flowrec.run.workers import Results, Worker
 from flowrec.stages import Inputs, Pipeline, recorded_extra, step, with_inputs
 
 SWITCH_S = 1e-4
 _END_NS, _AFTER_NS = NS_PER_S // 1000, NS_PER_S // 2  # from the last frame to the tick of its end; between later ticks
+
+
+class Joining(Protocol):
+    """Adds to the inputs what others than the rig send, while it is entered as a context."""
+
+    def __enter__(self) -> object: ...
+
+    def __exit__(self, *error: object) -> None: ...
+
+    def join(self, arriving: Iterator[Inputs]) -> Iterator[Inputs]:
+        """The inputs with what has come."""
 
 
 class Sink(Protocol):
@@ -89,7 +99,7 @@ def run(
     clocks: ClockMonitor | None = None,
     watchdog: Watchdog | None = None,
     paced: bool = False,
-    streams: Streams | None = None,
+    joining: Sequence[Joining] = (),
 ) -> RunReport:
     """Run until the rig ends, the mission is finished and the coils are at zero, or `control` stops the run.
 
@@ -111,7 +121,7 @@ def run(
     clocks : records the clocks, and the frames whose stamp did not increase.
     watchdog : that of this rig; None: one without a timer.
     paced : the worker takes real time, and the ticks after the end of the rig wait for it.
-    streams : of other programs and devices, whose messages join the inputs.
+    joining : messages and streams of other programs and devices, which join the inputs.
 
     Raises
     ------
@@ -142,8 +152,9 @@ def run(
         stack.callback(watchdog.field_off)
         stack.enter_context(control.interrupted_when_overdue())
         arriving = increasing_stamps(rig.inputs(), tick.stamp_ns, reject)
-        if streams is not None:
-            arriving = stack.enter_context(streams).join(arriving)
+        for each in joining:
+            stack.enter_context(each)
+            arriving = each.join(arriving)
         if live:
             arriving = checked_images(arriving, pipeline.image_shape, pipeline.image_bits)
             arriving = _and_afterwards(arriving, lambda: tick, paced=paced)

@@ -29,7 +29,7 @@ from flowrec.core import (
     one_blas_thread,
 )
 from flowrec.run.route_orders import observations_of, route, survey_route
-from flowrec.stages import Pipeline, keep_flow, no_route
+from flowrec.stages import Pipeline, as_planned, keep_flow, no_route
 
 Result = FlowField | Route
 Results = Mapping[str, Result]  # by field of Tick
@@ -73,6 +73,7 @@ def _compute(pipeline: Pipeline, order: Tick, mission: Mission) -> Result:
         return replace(solved, error_share=pipeline.refiner.prior_error_share(pipeline.chip, pipeline.solver))
     if mission.wanted == WorkOrder.REFINE:
         return _refine(pipeline, order, mission)
+    order = as_planned(order)
     if mission.wanted == WorkOrder.SURVEY_ROUTE:
         return survey_route(pipeline, order, mission)
     return route(pipeline, order, mission)

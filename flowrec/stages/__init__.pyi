@@ -23,6 +23,7 @@ from .estimation.consistency_monitor import EXPECTED_NIS as EXPECTED_NIS, Health
 from .estimation.kalman import Kalman as Kalman, memory_s as memory_s
 from .estimation.luenberger import Luenberger as Luenberger
 from .estimation.observer import OBSERVERS as OBSERVERS, Observer as Observer
+from .estimation.pump import as_planned as as_planned
 from .estimation.sampler import SAMPLERS as SAMPLERS, Trimmed as Trimmed
 from .estimation.smoother import observe as observe, smooth as smooth
 from .estimation.whitening import (
@@ -80,6 +81,7 @@ from .setting_rows import (
 from .simulated_settings import (
     Optics as Optics, Simulated as Simulated, SimulatedImage as SimulatedImage,
 )
+from .stream_settings import LOG as LOG, STREAM_KINDS as STREAM_KINDS, StreamSettings as StreamSettings
 from .vision.learned import View as View
 from .vision.learning import (
     MOST as MOST, bodies_like as bodies_like, bodies_that_stand_out as bodies_that_stand_out,

@@ -6,6 +6,7 @@ makes a ResolvedConfig of it, on a chip; a session carries that one, so a replay
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -39,12 +40,14 @@ from flowrec.physics import CHIP_KEYS, Calibration, Chip, ChipSettings, FlowSolv
 from flowrec.stages.control import Coils, Controller
 from flowrec.stages.control.mission import MissionStateMachine, PlacedMission
 from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
+from flowrec.stages.estimation.pump import PumpFollower
 from flowrec.stages.extra_topics import TOPIC_ROWS
 from flowrec.stages.outside_settings import extend_config, key_of_section, our_class, sections
 from flowrec.stages.planning import PLANNERS, Planner, SurveyPlanner
 from flowrec.stages.refine import Refiner
 from flowrec.stages.rig_settings import RIGS, SIMULATED, CameraSettings, Lab, MovieSettings, ResolvedCamera, Safety
 from flowrec.stages.simulated_settings import FIRST_WORLD, WORLDS, Simulated, SimulatedImage
+from flowrec.stages.stream_settings import StreamSettings
 from flowrec.stages.vision import Stabiliser, Tracker
 
 
@@ -117,6 +120,7 @@ class Config:
     duration_s: Annotated[float, Range(1e-3, 1e7)] | None = None
     # topics of other packages that are recorded besides flowrec's own
     topics: tuple[Annotated[str, TOPIC_ROWS], ...] = ()
+    streams: dict[str, StreamSettings] = field(default_factory=dict)  # of other programs, a section each
     chip: ChipSettings = field(default_factory=ChipSettings)
     robot: RobotSettings = field(default_factory=RobotSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
@@ -129,6 +133,7 @@ class Config:
     observer: Observer = field(default_factory=Observer)
     health: HealthMonitor = field(default_factory=HealthMonitor)
     sampler: Sampler = field(default_factory=Sampler)
+    pump: PumpFollower = field(default_factory=PumpFollower)
     flow: FlowSolver = field(default_factory=FlowSolver)
     refine: Refiner = field(default_factory=Refiner)
     survey: SurveyPlanner = field(default_factory=SurveyPlanner)
@@ -184,6 +189,7 @@ _MOVED = {
 }
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
+_OF_PYDANTIC = re.compile(r"(tuple|str|function)\b")  # parts of the place of an error that are no keys
 
 
 def load_config(
@@ -258,9 +264,9 @@ def _set_default(tree: dict[str, Any], key: str, value: Any) -> None:
 
 
 def to_toml(config: Config) -> str:
-    """The configuration as TOML, without the settings that are None, and without `topics` if there is none."""
+    """The configuration as TOML, without the settings that are None, and without `topics` and `streams` if empty."""
     tree = without_none(asdict(config))
-    return tomli_w.dumps(tree if config.topics else {key: each for key, each in tree.items() if key != "topics"})
+    return tomli_w.dumps({key: each for key, each in tree.items() if each or key not in ("topics", "streams")})
 
 
 def with_sets(
@@ -323,7 +329,7 @@ def _config_from(
         config: _AnyConfig = _ADAPTERS[kind].validate_python(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(part for part in map(str, first["loc"]) if not part.startswith(("tuple", "str", "function")))
+        key = ".".join(part for part in map(str, first["loc"]) if not _OF_PYDANTIC.match(part))
         if first["type"] == "missing":
             raise UsageError(f"{origin(key)}: {key} is missing; a session states it") from error
         raise UsageError(f"{origin(key)}: {type_error(kind, key, first['input'], first['msg'].lower())}") from error

@@ -21,6 +21,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from flowrec.core import (
     FACT,
+    NAME,
     MadeType,
     Methods,
     Origin,
@@ -30,6 +31,7 @@ from flowrec.core import (
     UsageError,
     arguments_of,
     hints,
+    named_section,
     outside_facts,
     refuse_unknown,
     remember_call,
@@ -59,7 +61,8 @@ def _with_fields(base: type, more: _Fields) -> type:
 @functools.cache
 def tables(root: type) -> tuple[tuple[str, Methods], ...]:
     """The settings of a configuration class that select a row of a table to which others may add, by key."""
-    return tuple((key, table) for key, table in all_tables(root) if table.group)
+    named = f".{NAME}."  # sections that a person names have the settings of others as a table of their own
+    return tuple((key, table) for key, table in all_tables(root) if table.group and named not in key)
 
 
 @functools.cache
@@ -70,6 +73,8 @@ def all_tables(root: type) -> tuple[tuple[str, Methods], ...]:
         inner = [(key, hint)]
         if isinstance(hint, type) and hasattr(hint, "__dataclass_fields__"):
             inner = [(f"{key}.{name}", each) for name, each in hints(hint).items()]
+        elif (named := named_section(hint)) is not None:
+            inner = [(f"{key}.{NAME}.{name}", each) for name, each in hints(named).items()]
         found += [(full, table) for full, each in inner for table in _tables_in(each)]
     return tuple(found)
 

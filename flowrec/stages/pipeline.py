@@ -17,6 +17,7 @@ from flowrec.core import (
     BY_FIELD,
     FIXED,
     NO_EXTRA,
+    PUMP,
     TOPICS,
     Action,
     Appearance,
@@ -56,6 +57,7 @@ from flowrec.stages.control.axes_check import leg_velocity, steady_velocity, wat
 from flowrec.stages.control.events import event_of
 from flowrec.stages.control.mission import MissionStateMachine
 from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
+from flowrec.stages.estimation.pump import PumpFollower, at_pump
 from flowrec.stages.extra_topics import ExtraStage, extra_rows, topics_of
 from flowrec.stages.planning import Planner, SurveyPlanner
 from flowrec.stages.refine import Refiner
@@ -112,6 +114,7 @@ class Pipeline:
     observer: Observer
     health: HealthMonitor
     sampler: Sampler
+    pump: PumpFollower
     mission: MissionStateMachine
     controller: Controller
     coils: Coils
@@ -128,6 +131,7 @@ class Pipeline:
 
 def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     """The stages of a resolved configuration on its chip."""
+    config.pump.refuse_unfit(chip, config.streams, inertia=config.flow.convection)
     return Pipeline(
         chip=chip,
         calibration=calibration_of(config, chip),
@@ -141,6 +145,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
         observer=config.observer,
         health=config.health,
         sampler=config.sampler,
+        pump=config.pump,
         mission=config.mission,
         controller=config.control,
         coils=config.coils,
@@ -306,7 +311,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     """
     p = pipeline
     tick = with_inputs(last, inputs, p.topics)
-    flow, route = tick.field, tick.route
+    pump = p.pump.follow(last, tick)
+    flow, route = at_pump(tick.field, pump), tick.route
     sight = _find_robot(p, last, inputs)
     track, appearance = sight.track, sight.appearance
     assert track is not None, "the tracker says of every image whether it shows the robot"
@@ -340,6 +346,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         measured = p.observer.measured_estimate(mapless, estimate)
     before = None if last.estimate is None else p.observer.measured_estimate(last.mapless, last.estimate)
     observations = p.sampler.collect(last.observations, before, measured, p.robot)
+    if pump is not None:
+        observations = p.pump.at_nominal(last.observations, observations, pump)
+        tick = replace(tick, extra=tick.extra.with_messages({PUMP: pump}))
     lap("observe")
     axes, driven_um_s = _axes(p, last, tick, track, rolled)
     mission = p.mission.update(

@@ -19,7 +19,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import tomli_w
 
-from flowrec.core import Methods, hints, range_of, unit_of, without_none
+from flowrec.core import NAME, Methods, hints, named_section, range_of, unit_of, without_none
 from flowrec.stages.config import Config
 
 _WIDTH = 96  # of the comments
@@ -70,6 +70,9 @@ def setting_rows(section: type = Config, prefix: str = "") -> Iterator[SettingRo
         if is_dataclass(hint):
             yield from setting_rows(hint, f"{key}.")  # type: ignore[arg-type]
             continue
+        if (named := named_section(hint)) is not None:
+            yield from setting_rows(named, f"{key}.{NAME}.")
+            continue
         default = each.default if each.default_factory is MISSING else each.default_factory()
         read_by = readers.get(each.name, ())
         meaning = meanings.get(each.name, "")
@@ -108,7 +111,7 @@ def commented_toml(config: Config, changed_only: bool = False) -> str:
         prefix = f"{section}." if section else ""
         told: list[str] = []
         for name, value in values.items():
-            row = rows.get(prefix + name)
+            row = rows.get(prefix + name) or rows.get(f"{section.rpartition('.')[0]}.{NAME}.{name}")
             if row is not None and changed_only and toml_value(row.default) == toml_value(value):
                 continue
             about = f"{row.meaning} ({row.facts})" if row is not None else ""

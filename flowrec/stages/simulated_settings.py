@@ -40,6 +40,15 @@ class SimulatedImage:
 
 
 @dataclass(frozen=True, slots=True)
+class PumpSensorSettings:
+    """Section [simulated.sensor]: the flow sensor at the simulated pump, a stream of the kind `simulated`."""
+
+    rate_hz: Annotated[float, Range(0.01, 1e4)] = 10.0  # samples per second
+    noise_share: Annotated[float, Range(0.0, 1.0)] = 0.01  # standard deviation of a sample, as a ratio of the flow
+    delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # from the flow to the sample that shows it
+
+
+@dataclass(frozen=True, slots=True)
 class Simulated:
     """Differences between the simulated and the assumed world, and noise; drawn from the seed.
 
@@ -76,6 +85,10 @@ class Simulated:
     pulsation_hz: _Rate | None = None
     # phase of the pump's pulsation; None, also in the preset: drawn from 0 to 360
     pulsation_phase_deg: Angle | None = None
+    # The true flow changes once, to this ratio of what it was, after step_s.
+    step_share: Annotated[float, Range(0.0, 10.0)] = 1.0
+    step_s: Annotated[float, Range(0.0, 1e6)] = 0.0  # time of that change
+    sensor: PumpSensorSettings = field(default_factory=PumpSensorSettings)
     k: Annotated[int, OneOf(1, 2, 4)] | None = None  # cells of the true flow per pixel side of the true walls' mask
     # True um per revolution: the assumed one times up to 1 +- this.
     um_per_rev_error: _PartOf | None = None

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from flowrec.physics import Calibration, Chip
     from flowrec.stages import ResolvedConfig
     from flowrec.store.reader import Frames, SessionReader
+    from flowrec.store.stream_samples import Channel
     from flowrec.store.tables import Tables
 
 _CARD_PX = 240  # width of the picture of a card
@@ -205,6 +206,12 @@ class Session:
     def messages(self, field: str) -> Iterator[Any]:
         """All messages of one topic, named by its field of `Tick` or its path; SessionError if there is none."""
         return self.reader.messages(field)
+
+    def stream(self, channel: str) -> Channel:
+        """Samples of a channel of a stream, such as "pump/flow": `time_s`, `value`, `unit`; SessionError if none."""
+        from flowrec.store.stream_samples import channel_of
+
+        return channel_of(self.reader, channel)
 
     def table(self, topic: str) -> pa.Table:
         """All messages of one topic as an Arrow table, one row a message; `.to_pandas()` makes a DataFrame of it.

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from flowrec.core import (
     CRYSTAL_PPM,
     NS_PER_S,
     NUMERICS_VERSION,
+    SILENT,
     Coverage,
     FlowrecError,
     Outcome,
@@ -264,6 +266,26 @@ class FileCheck:
                 verdict.odd("drops", f"{losses.triggers} triggers that the camera has not answered")
             if losses.reconnections:
                 verdict.odd("drops", f"the camera was absent {losses.reconnections} times, and came back")
+
+        if tally.streams is not None:
+            self._streams(tally.streams)
+
+    def _streams(self, states: Any) -> None:
+        """Samples of the streams of other programs: a fact, and what was lost or stepped."""
+        names = states.streams.split("\n")
+        counts = zip(names, states.samples.tolist(), strict=False)
+        self.verdict.fact("streams", ", ".join(f"{name}: {count} samples" for name, count in counts))
+        told = {
+            "samples thrown away by the queue before the loop": states.lost,
+            "samples missing, as gaps in the stamps show": states.missing,
+            "steps of the sender's clock, taken out": states.steps,
+            "interruptions, after which it came back": states.restarts,
+        }
+        for number, (name, state) in enumerate(zip(names, states.state.tolist(), strict=False)):
+            odd = [f"{count} {what}" for what, counts in told.items() for count in counts[number : number + 1] if count]
+            odd += ["silent at the end"] if state == SILENT else []
+            if odd:
+                self.verdict.odd("streams", f"{name}: {', '.join(odd)}")
 
     def _numbers(self) -> None:
         self.not_finite(self.verdict)

@@ -63,7 +63,7 @@ def methods(
 
 def _words(row: "ListedMethod") -> set[str]:
     """The words by which a person may name the stage of a row."""
-    return {word for word in row.setting.lstrip("-").split(".") if word not in ("method", "lab")}
+    return {word for word in row.setting.lstrip("-").split(".") if word not in ("method", "lab", "NAME", "kind")}
 
 
 def _rows() -> Iterator["ListedMethod"]:

@@ -30,16 +30,18 @@ from flowrec.core import (
     say,
     warn,
 )
-from flowrec.rigs import Connecting, MovieRig, Picturing, Rig
+from flowrec.rigs import Connecting, MovieRig, Picturing, Rig, RunLog
 from flowrec.run import (
     CommandSocket,
     DiskMonitor,
+    Joining,
     LockstepWorker,
     Preloaded,
     ProcessWorker,
     RunControl,
     RunReport,
     Sink,
+    StreamInputs,
     Streams,
     Watchdog,
     Worker,
@@ -88,6 +90,7 @@ def run_mission(
     inputs: Sequence[Path] = (),
     console: bool = False,
     looked: Looked | None = None,
+    log: RunLog | None = None,
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
@@ -103,6 +106,7 @@ def run_mission(
     console : serve a page on this machine that shows the run and steers it.
     looked : of an import, what the movie has shown before. It can be done again: one that ends by an exception leaves
         no file, and one that it was to replace stays.
+    log : values of this program, which are recorded beside the run.
 
     Raises
     ------
@@ -120,7 +124,7 @@ def run_mission(
     output = Output(place_of_session(resolved, out, overwrite), MCAP, inputs, overwrite)
     if view == "rrd":
         Output(output.path.with_suffix(RRD[0]), RRD, inputs, overwrite).check()
-    mission = _Mission(prepared, output, looked, realtime, timeout_s, control or Unattended())
+    mission = _Mission(prepared, output, looked, realtime, timeout_s, control or Unattended(), log)
     with ExitStack() as stack:
         # From the first byte of the file to the last, every way to end the run leaves a complete file.
         mission.connect(stack)
@@ -153,12 +157,13 @@ class _Mission:
         realtime: bool,
         timeout_s: float | None,
         control: Unattended,
+        log: RunLog | None,
     ) -> None:
         """Make the rig, which is not connected yet.
 
         Parameters
         ----------
-        looked, realtime : as of `run_mission`.
+        looked, realtime, log : as of `run_mission`.
         timeout_s : of the watchdog; None: it has no timer.
         """
         config, pipeline = prepared.config, prepared.pipeline
@@ -173,7 +178,11 @@ class _Mission:
             self._rig.tell = warn
         self._watchdog = Watchdog(self._rig, timeout_s, partial(self.run_control.stop, zero=True), warn)
         self._statistics, self._clocks, self._judges = RunStatistics(), ClockMonitor(), judges_of(pipeline)
-        self._streams = Streams(extra_rows(config), warn) if config.topics else None
+        self._joining: list[Joining] = [Streams(extra_rows(config), warn)] if config.topics else []
+        self._streams: StreamInputs | None = None
+        if config.streams:
+            self._streams = StreamInputs(config.streams, self._rig, self.run_control, warn, log, realtime=realtime)
+            self._joining.append(self._streams)
         self._opened: list[SessionWriter] = []  # the writer, once there is one: the thread of the signals looks here
         self._low: list[str] = []  # why the disk monitor has ended the run
         self._priorities: dict[str, str] = {}
@@ -189,6 +198,8 @@ class _Mission:
         )
         if isinstance(rig, Connecting):
             stack.enter_context(rig.connected())
+        if self._streams is not None:
+            self._streams.connect(stack)
         if isinstance(rig, Picturing) and config.mission.check_axes:
             verdict = checked_image(rig.picture(), config, chip, "camera")
             self._source |= {"source_axes": verdict.text} if verdict is not None else {}
@@ -272,7 +283,7 @@ class _Mission:
                 clocks=self._clocks,
                 watchdog=self._watchdog,
                 paced=self._realtime,
-                streams=self._streams,
+                joining=self._joining,
             )
         if self._realtime:
             granted = {"loop_priority": first, "writer_priority": writes_first}

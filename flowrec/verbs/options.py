@@ -106,6 +106,7 @@ def _bar() -> Any:
 Bar = Callable[[str, float, str], AbstractContextManager[Callable[[float], None]]]  # what is done, total, unit
 BAR = Supplied(_bar)
 ATTENDED = Supplied(_at_terminal)  # of the parameter `control`: a person attends a command, and nobody a call
+OF_A_CALL = Supplied(lambda: None)  # of what only a program can give
 AS_THE_COMMAND = Supplied(lambda: True)  # of what a command does otherwise than a call
 
 

@@ -8,9 +8,20 @@ import typer
 
 from flowrec.core import View
 from flowrec.verbs.command import MisuseError, Told, verb
-from flowrec.verbs.options import AS_THE_COMMAND, ATTENDED, AsConfig, Asked, Overwrite, SessionOut, Sets, readable_toml
+from flowrec.verbs.options import (
+    AS_THE_COMMAND,
+    ATTENDED,
+    OF_A_CALL,
+    AsConfig,
+    Asked,
+    Overwrite,
+    SessionOut,
+    Sets,
+    readable_toml,
+)
 
 if TYPE_CHECKING:
+    from flowrec.rigs import RunLog
     from flowrec.stages import Config
     from flowrec.verbs.doctor import Diagnosis
     from flowrec.verbs.interactive import Unattended
@@ -110,6 +121,7 @@ def record(
         Path | None, typer.Option(metavar="KEY", help="Sign the session with this SSH key when it is complete.")
     ] = None,
     movie_in_time: Annotated[bool, AS_THE_COMMAND] = False,
+    log: Annotated["RunLog | None", OF_A_CALL] = None,
 ) -> "Union[Recorded, DryRun]":  # noqa: UP007 - as text
     """Run a mission (survey, refine, plan, navigate) and record every stage.
 
@@ -117,6 +129,8 @@ def record(
     ----------
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
     movie_in_time : a movie is taken in real time; False: as fast as it can be read.
+    log : values that this program gives while the run goes on, `log.log("pump/pressure", time.monotonic_ns(), 2.1e4)`:
+        they are recorded as the stream `log`, unless a section [streams.NAME] of the kind `log` takes them.
 
     Notes
     -----
@@ -147,7 +161,10 @@ def record(
             given |= found
             flags |= dict.fromkeys(found, flag)
     chosen, inputs = config_of_call(config, given, flags)
-    from flowrec.stages import MOVIE
+    from flowrec.stages import LOG, MOVIE, with_sets
+
+    if log is not None and LOG not in chosen.streams:
+        chosen = with_sets(chosen, {f"streams.{LOG}.kind": LOG})
 
     path = None if out is None else Path(out)
     if short and not dry_run:
@@ -172,7 +189,7 @@ def record(
     realtime = realtime or (movie_in_time and chosen.rig == MOVIE)
     if sign is not None:
         refuse_unusable_key(sign)
-    recorded = run_mission(chosen, path, view, realtime, overwrite, control, inputs, console=console)
+    recorded = run_mission(chosen, path, view, realtime, overwrite, control, inputs, console=console, log=log)
     if sign is not None:
         for file in recorded.sessions:
             sign_file(file, sign, overwrite=False)

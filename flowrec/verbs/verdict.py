@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from flowrec.core import (
     FIXED,
+    STREAMS,
     Applied,
     CameraLosses,
     Clocks,
@@ -82,6 +83,7 @@ class Tally:
     repeated, repeated_ns : messages of the keyframe of a part, by field of Tick: number, and own stamp.
     latest_ns : own stamp of the last message, by field of Tick.
     losses : what the camera had lost at the last count; None: it does not count.
+    streams : the last state of the streams of other programs, in the type of the file; None: there are none.
     quality : judges the track; None: the head can not be read, which `check` tells elsewhere.
     """
 
@@ -94,6 +96,7 @@ class Tally:
         self.latest_ns: dict[str, int] = {}
         self.clocks = ClockTally()
         self.losses: CameraLosses | None = None
+        self.streams: Any = None
         self._intervals: Counter[int] = Counter()
         self._longest: list[tuple[int, int]] = []  # a heap of length and beginning in ns
         self._last_ns: int | None = None
@@ -140,6 +143,8 @@ class Tally:
             self.clocks.add(message)
         elif isinstance(message, CameraLosses):
             self.losses = message
+        elif name == STREAMS and hasattr(message, "restarts"):  # else of another package
+            self.streams = message
 
     def close(self) -> None:
         """Count the ticks that did not become complete, and judge the last track."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flowrec.core import Message, Topic, message_fields
+from flowrec.core import SAMPLES, Message, Topic, message_fields
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,3 +65,13 @@ def plot_of(topic: Topic, first: Message | None) -> Plot | None:
         elif each.kind == "vector" and first is not None:
             lines += [f"{each.name}[{number}]" for number in range(len(getattr(first, each.name)))]
     return Plot(topic.path, topic.path, {line: line for line in lines[:_LINES]}) if lines else None
+
+
+def stream_plots(units: Mapping[str, str]) -> list[Plot]:
+    """A plot of each stream, with the latest values of its channels; `units` by name stream/channel, in order."""
+    streams: dict[str, dict[str, str]] = {}
+    for place, (name, unit) in enumerate(units.items()):
+        lines = streams.setdefault(name.partition("/")[0], {})
+        if len(lines) < _LINES:
+            lines[f"latest[{place}]"] = f"{name} ({unit})" if unit else name
+    return [Plot(f"Stream {stream}", SAMPLES, lines) for stream, lines in streams.items()]

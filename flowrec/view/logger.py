@@ -10,6 +10,8 @@ import rerun as rr
 from flowrec.core import (
     ALARM_WORDS,
     NS_PER_S,
+    SAMPLES,
+    STREAMS,
     Action,
     Alarm,
     Applied,
@@ -167,6 +169,7 @@ class TickLogger:
         self._flow = maps.FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds)
         self._tick = self._last = Tick()
         self._tells_flow = True
+        self._named: dict[str, int] = {}  # number of lines of the plots of streams
         left, _, right, _ = scene.image_bounds()
         self._unit_px = (right - left) / NOMINAL_PX
         self._trail = Trail(_TRAIL_STEP_PX * self._unit_px)
@@ -199,7 +202,11 @@ class TickLogger:
         for message in tick.news(self._last, _SHOWN).values():
             self._log_message(message)
         for path, message in tick.extra.items():
-            if message is not self._last.extra.get(path):
+            if message is self._last.extra.get(path):
+                continue
+            if path == SAMPLES and hasattr(message, "latest") and hasattr(tick.extra.get(STREAMS), "channels"):
+                self._log_streams(message, tick.extra[STREAMS])
+            else:
                 self._log_extra(path, message)
 
     def _log_message(self, message: Message) -> None:
@@ -251,6 +258,18 @@ class TickLogger:
             values = np.atleast_1d(np.asarray(getattr(message, each.name), np.float64))  # None becomes NaN
             if np.isfinite(values).any():
                 self._scalars(f"{e.EXTRA}{path}/{each.name}", *values.tolist())
+
+    def _log_streams(self, samples: Message, states: Message) -> None:
+        """The latest values of the channels: the lines of a stream in one plot. Of a file the types are not ours."""
+        lines: dict[str, dict[str, float]] = {}
+        for name, value in zip(states.channels.split("\n"), samples.latest, strict=False):  # type: ignore[attr-defined]
+            stream, _, channel = name.partition("/")
+            lines.setdefault(f"{e.EXTRA}/streams/{stream}", {})[channel] = float(value)
+        for entity, values in lines.items():
+            if self._named.get(entity) != len(values):
+                self._named[entity] = len(values)
+                self._log(entity, rr.SeriesLines(names=list(values)), static=True)
+            self._scalars(entity, *values.values())
 
     def _log_image(self, frame: Frame) -> None:
         if self._style.second or frame.image.size == 0:  # the images of two sessions are those of the first

@@ -12,10 +12,29 @@ from flowrec.core.messages.control import AxesCheck, Currents, Demand, Event, Mi
 from flowrec.core.messages.estimation import Estimate, Health, Observations
 from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, Measured, OperatorEvent, Truth, pixel_type
 from flowrec.core.messages.slow_stages import FlowField, Route
+from flowrec.core.messages.streams import (
+    BY_STREAM,
+    EXPECTED,
+    HEARD,
+    PUMP,
+    SAMPLES,
+    SILENT,
+    STREAMS,
+    PumpShare,
+    Samples,
+    StreamStates,
+)
 from flowrec.core.messages.vision import Appearance, Background, Shift, Track, shift_px
 
 __all__ = [
+    "BY_STREAM",
+    "EXPECTED",
+    "HEARD",
     "PIXEL_BITS",
+    "PUMP",
+    "SAMPLES",
+    "SILENT",
+    "STREAMS",
     "Appearance",
     "Applied",
     "AxesCheck",
@@ -31,8 +50,11 @@ __all__ = [
     "Mission",
     "Observations",
     "OperatorEvent",
+    "PumpShare",
     "Route",
+    "Samples",
     "Shift",
+    "StreamStates",
     "Track",
     "Truth",
     "pixel_type",

@@ -76,6 +76,7 @@ class LabRig:
                 f"safety.guard_timeout_s = {guard_s:g}"
             )
         self.tell: Callable[[str], None] = lambda _text: None
+        self.epoch_ns: int | None = None
         self.drive = drive
         self._make_grabber = make_grabber
         self._grabber: Grabber | None = None
@@ -142,6 +143,7 @@ class LabRig:
         first = self._first(grabber)
         assert grabber.losses is not None, "a frame was handed on"
         session = _Session(first, grabber.losses)
+        self.epoch_ns = first.stamp_ns
         frame: Captured | None = first
         last_ns, absent_until_ns = session.stamp_ns(first.stamp_ns), None
         before_ns: int | None = None

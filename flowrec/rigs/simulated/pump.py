@@ -18,6 +18,7 @@ class Pump:
     pulsation_share, pulsation_hz, phase_rad : of the pulsation.
     drift_share, drift_s : one sigma of the drift, and its correlation time.
     rng : its random numbers.
+    step_share, step_s : ratio to which the flow changes once, and when.
     """
 
     def __init__(
@@ -28,16 +29,21 @@ class Pump:
         drift_share: float,
         drift_s: float,
         rng: np.random.Generator,
+        step_share: float = 1.0,
+        step_s: float = 0.0,
     ) -> None:
         self._share, self._hz, self._phase_rad = pulsation_share, pulsation_hz, phase_rad
         self._drift_share = drift_share
         self._decay = math.exp(-_STEP_S / drift_s)
         self._rng = rng
+        self._step_share, self._step_s = step_share, step_s
         self._drift = [float(rng.standard_normal())]  # in standard deviations, every _STEP_S
 
     def strength(self, time_s: float) -> float:
         """The flow at a time over the steady one."""
         pulsation = 1.0 + self._share * math.sin(2.0 * math.pi * self._hz * time_s + self._phase_rad)
+        if self._step_share != 1.0 and time_s >= self._step_s:
+            pulsation *= self._step_share
         return (1.0 + self._drift_at(time_s)) * pulsation if self._drift_share > 0.0 else pulsation
 
     def mean_drift(self, until_s: float) -> float:

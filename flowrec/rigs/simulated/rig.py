@@ -33,7 +33,9 @@ from flowrec.core import (
 from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.pump_sensor import PumpSensor
 from flowrec.rigs.simulated.world import Shake, TrueCoils, World, misregister, true_pump, true_robot, world_of
+from flowrec.rigs.streams.stream import SampleStream
 from flowrec.stages import (
     Coils,
     FieldCommand,
@@ -43,6 +45,7 @@ from flowrec.stages import (
     ResolvedCamera,
     ResolvedConfig,
     Simulated,
+    StreamSettings,
     field_motion,
     registration_of,
 )
@@ -171,6 +174,14 @@ class SimulatedRig:
         # Set by zero(), in any thread: one attribute, which the loop's thread reads before every step of the world. A
         # lock could be held by an interrupted loop.
         self._cut = False
+        self.epoch_ns: int | None = None
+
+    def stream(self, name: str, settings: StreamSettings) -> SampleStream:
+        """The flow sensor at its pump; see rigs.rig.Measuring."""
+        sensor = self._simulated.sensor
+        return PumpSensor(
+            self.pump, sensor.rate_hz, sensor.noise_share, sensor.delay_s, self._simulated.seed, lambda: self._now_ns
+        )
 
     def __enter__(self) -> SimulatedRig:
         self._cut = False
@@ -247,6 +258,7 @@ class SimulatedRig:
                 # An image arrives after its exposure. The first one, with all its preparation, sets the clock.
                 over_ns = nanoseconds(0.5 * self._camera.exposure_s)
                 began_ns = time.monotonic_ns() - over_ns if began_ns is None else began_ns
+                self.epoch_ns = began_ns
                 time.sleep(max(0.0, seconds(began_ns + arrival_ns + over_ns - time.monotonic_ns())))
                 arrival_ns = time.monotonic_ns() - began_ns - over_ns
             fit = host_clock.take(fit, camera_clock.device(stamp), arrival_ns)

@@ -107,7 +107,7 @@ def true_pump(simulated: Simulated) -> Pump:
         phase_deg = drawn_from(seed, "pulsation_phase").uniform(0.0, 360.0)
     drift = simulated.value("drift_share"), simulated.value("drift_s")
     pulse = simulated.value("pulsation_share"), hz, math.radians(phase_deg)
-    return Pump(*pulse, *drift, drawn_from(seed, "drift"))
+    return Pump(*pulse, *drift, drawn_from(seed, "drift"), simulated.step_share, simulated.step_s)
 
 
 def misregister(stated: Calibration, simulated: Simulated, size_px: tuple[int, int]) -> Calibration:

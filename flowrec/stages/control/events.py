@@ -10,6 +10,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from flowrec.core import (
+    BY_STREAM,
+    EXPECTED,
+    HEARD,
+    SILENT,
+    STREAMS,
     Action,
     Alarm,
     AxesVerdict,
@@ -22,6 +27,7 @@ from flowrec.core import (
     OperatorEvent,
     Outcome,
     Phase,
+    StreamStates,
     Tick,
     seconds,
 )
@@ -45,6 +51,7 @@ def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | 
         *_health(last.health, tick.health),
         *_operator(last, tick),
         *_axes(last, tick),
+        *_streams(last, tick),
         *_mission(last, tick),
     ]
     if not lines:
@@ -192,6 +199,25 @@ def _axes(last: Tick, tick: Tick) -> Iterator[Line]:
         yield axes.text, Level.WARNING
 
 
+def _streams(last: Tick, tick: Tick) -> Iterator[Line]:
+    """Streams that have stopped or are back, and steps of their clocks."""
+    states, before = tick.extra.get(STREAMS), last.extra.get(STREAMS)
+    if not isinstance(states, StreamStates) or states is before:
+        return
+    was = dict[str, tuple[int, int]]()
+    if isinstance(before, StreamStates):
+        was = {name: (int(before.state[n]), int(before.steps[n])) for n, name in enumerate(before.stream_names())}
+    for number, name in enumerate(states.stream_names()):
+        state, steps = int(states.state[number]), int(states.steps[number])
+        state_before, steps_before = was.get(name, (EXPECTED, 0))
+        if state == SILENT and state_before != SILENT:
+            yield f"stream {name} is silent", Level.WARNING
+        elif state == HEARD and state_before == SILENT:
+            yield f"stream {name} is back", None
+        if steps > steps_before:
+            yield f"stream {name}: the sender's clock has stepped; its stamps are shifted", Level.WARNING
+
+
 def _mission(last: Tick, tick: Tick) -> Iterator[Line]:
     """Holds, losses of sight and phases."""
     mission, before = tick.mission, last.mission
@@ -225,7 +251,10 @@ def _hold(last: Tick, tick: Tick) -> Iterator[str]:
     if since_ns is None:
         wait = f" (the {mission.wanted.replace('_', ' ')} that it waits for goes on)" if mission.wanted else ""
         no_route = mission.phase == Phase.PLAN and not mission.wanted
-        yield f"held: {mission.note}" if no_route else f"held by the operator{wait}"
+        asked = tick.operator
+        by_stream = asked is not None and asked is not last.operator and asked.text.startswith(BY_STREAM)
+        by = f"held: {asked.text}" if asked is not None and by_stream else "held by the operator"
+        yield f"held: {mission.note}" if no_route else f"{by}{wait}"
     if before is not None and mission.swept != before.swept:
         off = f" by {demand.error_um:.0f} um" if demand is not None else ""
         why = ": the flow is faster than the robot" if demand is not None and demand.saturated else ""

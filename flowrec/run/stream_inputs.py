@@ -1,0 +1,246 @@
+"""The streams of a run as its inputs: at each tick the samples that have come since the one before, as one message.
+
+The stamps of samples are on the session clock. In real time this is the host's monotonic clock from the rig's stamp 0
+on; what a simulated rig measures has its stamps from the rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from flowrec.core import (
+    BY_STREAM,
+    EXPECTED,
+    HEARD,
+    NS_PER_S,
+    SAMPLES,
+    SILENT,
+    STREAMS,
+    Action,
+    Floats,
+    Message,
+    Samples,
+    StreamStates,
+    UsageError,
+    seconds,
+)
+from flowrec.rigs import Clocked, LogStream, Measuring, Rig, RunLog, SampleStream, settings_of_device
+from flowrec.run.control import RunControl
+from flowrec.run.stream_reader import StreamReader
+from flowrec.stages import STREAM_KINDS, Inputs, StreamSettings
+
+_STATED_NS = NS_PER_S  # from one message with the state of the streams to the next, if only counts have changed
+
+
+@dataclass(slots=True)
+class _Known:
+    """A reader, and what the run has of it."""
+
+    reader: StreamReader
+    places: list[int]  # of its channels in the list of all
+    own_clock: bool  # its stamps are on the session clock already
+    heard_ns: int | None = None  # stamp of the tick with its latest samples; None: no tick yet
+    state: int = EXPECTED
+    holds: bool = False  # the robot is held because of it
+
+
+class StreamInputs:
+    """The streams of a configuration, read while it is entered as a context.
+
+    Parameters
+    ----------
+    settings : sections [streams.NAME] by name.
+    rig : of the run; it states when its stamp was 0, and a simulated one has a sensor.
+    control : a stream that stops can hold the robot or end the run.
+    tell : called with one line when a stream ends, comes back, or its clock steps.
+    log : values of the program that records, for the streams of the kind `log`.
+    realtime : the run keeps to the wall clock.
+    make : makes the stream of a section, as `stream_of` does.
+
+    Raises
+    ------
+    UsageError : a stream that this rig can not have.
+    """
+
+    def __init__(
+        self,
+        settings: Mapping[str, StreamSettings],
+        rig: Rig,
+        control: RunControl,
+        tell: Callable[[str], None],
+        log: RunLog | None = None,
+        *,
+        realtime: bool,
+        make: Callable[..., SampleStream] | None = None,
+    ) -> None:
+        self._clocked = rig if isinstance(rig, Clocked) else None
+        self._control = control
+        streams = {name: (make or stream_of)(name, each, rig, realtime=realtime) for name, each in settings.items()}
+        self._known = [
+            _Known(StreamReader(name, stream, settings[name], tell), [], _needs_rig(settings[name]))
+            for name, stream in streams.items()
+        ]
+        self._log = log
+        self._logged: dict[str, LogStream] = {
+            name: stream for name, stream in streams.items() if isinstance(stream, LogStream)
+        }
+        self._channels: list[str] = []
+        self._units: list[str] = []
+        self._latest: Floats = np.zeros(0)
+        self._stated_ns = -_STATED_NS
+        self._stated: tuple[object, ...] = ()
+
+    def connect(self, stack: ExitStack) -> None:
+        """Find all senders; the stack closes them again.
+
+        Raises
+        ------
+        RigError : one line; a sender that is not there, or can not be used.
+        """
+        for each in self._known:
+            stack.callback(each.reader.close)
+            each.reader.connect()
+        if self._log is not None:
+            self._log.attach(self._logged)
+            stack.callback(self._log.attach, {})
+
+    def __enter__(self) -> Self:
+        for each in self._known:
+            each.reader.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for each in self._known:
+            each.reader.close()
+
+    def join(self, arriving: Iterator[Inputs]) -> Iterator[Inputs]:
+        """The inputs with the samples that have come since the last ones, and the state of the streams."""
+        for inputs in arriving:
+            new: dict[str, Message] = {}
+            samples = self._samples(inputs.stamp_ns)
+            if samples is not None:
+                new[SAMPLES] = samples
+            self._judge(inputs.stamp_ns)
+            states = self._states(inputs.stamp_ns)
+            if states is not None:
+                new[STREAMS] = states
+            yield replace(inputs, extra={**inputs.extra, **new}) if new else inputs
+
+    def _samples(self, stamp_ns: int) -> Samples | None:
+        epoch_ns = (self._clocked.epoch_ns if self._clocked is not None else None) or 0
+        channel, times, values = [], [], []
+        for each in self._known:
+            each.heard_ns = stamp_ns if each.heard_ns is None else each.heard_ns
+            taken = each.reader.take()
+            self._name_channels(each)
+            if not taken:
+                continue
+            each.heard_ns = stamp_ns
+            each.state = max(each.state, HEARD)
+            places = np.array(each.places, np.int32)
+            for part in taken:
+                channel.append(places[part.channel])
+                times.append(part.times_ns - (0 if each.own_clock else epoch_ns))
+                values.append(part.values)
+        if not values:
+            return None
+        places, found = np.concatenate(channel), np.concatenate(values)
+        latest = np.full(len(self._channels), np.nan)
+        latest[: len(self._latest)] = self._latest
+        latest[places] = found  # of several values of a channel numpy keeps the last
+        self._latest = latest
+        return Samples(stamp_ns, places, np.concatenate(times), found, latest)
+
+    def _name_channels(self, known: _Known) -> None:
+        """Give a place to channels that are new; no channel ever changes its place."""
+        head = known.reader.head
+        for number in range(len(known.places), len(head.channels)):
+            known.places.append(len(self._channels))
+            self._channels.append(f"{known.reader.name}/{head.channels[number]}")
+            self._units.append(head.units[number])
+
+    def _judge(self, stamp_ns: int) -> None:
+        """Tell which streams are silent, and do what their settings say."""
+        for each in self._known:
+            assert each.heard_ns is not None, "the samples have been taken"
+            reader = each.reader
+            quiet_s = seconds(stamp_ns - each.heard_ns)
+            gone = reader.state.gone and quiet_s > 0.0
+            silent = gone or quiet_s > reader.silence_s
+            if silent == (each.state == SILENT):
+                continue
+            if not silent and quiet_s > 0.0:
+                continue  # nothing has come since
+            each.state = SILENT if silent else HEARD
+            text = f"{BY_STREAM}{reader.name} is {'silent' if silent else 'back'}"
+            if silent and reader.settings.on_silence == "stop":
+                self._control.stop(text)
+            elif silent and reader.settings.on_silence == "hold":
+                each.holds = self._control.request(Action.PAUSE, text)
+            elif not silent and each.holds:
+                each.holds = False
+                if not any(other.holds for other in self._known):
+                    self._control.request(Action.RESUME, text)
+
+    def _states(self, stamp_ns: int) -> StreamStates | None:
+        """The state of the streams, if it has changed, and about once a second."""
+        counts = [each.reader.state for each in self._known]
+        judged = [(each.state, count.steps, count.restarts) for each, count in zip(self._known, counts, strict=True)]
+        key = (len(self._channels), *judged)
+        due = stamp_ns - self._stated_ns >= _STATED_NS
+        if key == self._stated and not due:
+            return None
+        self._stated, self._stated_ns = key, stamp_ns
+        counts = [each.reader.counts() for each in self._known]
+        made = {
+            name: np.array([getattr(count, name) for count in counts], kind)
+            for names, kind in ((_WHOLE, np.int64), (_FLOATS, np.float64))
+            for name in names
+        }
+        return StreamStates(
+            stamp_ns,
+            "\n".join(each.reader.name for each in self._known),
+            "\n".join(self._channels),
+            "\n".join(self._units),
+            np.array([each.state for each in self._known], np.int32),
+            **made,  # type: ignore[arg-type]
+        )
+
+
+_WHOLE = ("samples", "lost", "missing", "steps", "restarts")
+_FLOATS = ("correction_s", "age_s", "jitter_s")
+
+
+def _needs_rig(settings: StreamSettings) -> bool:
+    return "rig" in STREAM_KINDS[settings.kind].needs
+
+
+def stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool) -> SampleStream:
+    """The stream of a section.
+
+    Raises
+    ------
+    UsageError : this rig can not have it.
+    """
+    if _needs_rig(settings):
+        if not isinstance(rig, Measuring):
+            raise UsageError(f"streams.{name}.kind = {settings.kind!r}: this rig measures nothing; name another kind")
+        return rig.stream(name, settings)
+    if not realtime or not isinstance(rig, Clocked):
+        raise UsageError(
+            f"streams.{name}.kind = {settings.kind!r}: samples of other programs come in real time; record with "
+            "--realtime or the rig lab, or leave the section out"
+        )
+    row = STREAM_KINDS[settings.kind]
+    if row.source is not None:
+        device = settings_of_device(row.settings, settings.device, f"streams.{name}.device")
+        settings = replace(settings, device=device)
+    elif settings.device:
+        raise UsageError(f"streams.{name}.device: the kind {settings.kind!r} has no settings of its own; leave it out")
+    stream: SampleStream = row.load().of(name, settings)
+    return stream

@@ -1,0 +1,163 @@
+"""The pump as a measurement: the flow of the map follows a measured flow rate or pressure from tick to tick.
+
+Without inertia a Newtonian flow between outlets of one pressure is proportional to the speed at its inlets, so that of
+one pump's flow no new solution is needed: u(x, t) = r(t) u_0(x), where r is the measured value over the one at which
+the inlets have the speeds that the chip states, and u_0 the map, assumed or refined. Observations are divided by r, so
+that a refinement sees a steady flow; the error of the measurement is added to theirs.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+
+from flowrec.core import (
+    NS_PER_S,
+    PUMP,
+    SAMPLES,
+    STREAMS,
+    Estimate,
+    FlowField,
+    Observations,
+    PumpShare,
+    Range,
+    Samples,
+    StreamStates,
+    Tick,
+    UsageError,
+    seconds,
+)
+from flowrec.physics import Chip
+from flowrec.stages.estimation.kalman import memory_s
+
+_SLOW_S = 5.0  # memory of the mean that plans are made with
+_REYNOLDS = 1.0  # above it a flow is not proportional to the speed at its inlets
+_LEAST = (
+    0.02  # of the share; observations of a flow that nearly stands still say nothing of the flow at the nominal one
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PumpFollower:
+    """A measured flow rate or pressure of the pump that feeds all inlets; the flow of the map follows it."""
+
+    channel: str = ""  # stream and channel that measure it, such as pump/flow; '': nothing does
+    # value of the channel, in its unit, at which the inlets have the speeds that the chip states
+    nominal: Annotated[float, Range(1e-12, 1e12)] = 1.0
+    error_share: Annotated[float, Range(0.0, 1.0)] = 0.02  # standard deviation of the measured value, as a ratio
+    delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # from a change of the flow to the sample that shows it
+    smoothing_s: Annotated[float, Range(0.0, 60.0)] = 0.05  # memory of the mean over samples
+
+    def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool) -> None:
+        """Raise UsageError where the flow of a chip does not follow its pump by a factor, or no stream measures it."""
+        if not self.channel:
+            return
+        where = f"pump.channel = {self.channel!r}"
+        name = self.channel.partition("/")[0]
+        if name not in streams:
+            there = ", ".join(sorted(streams)) or "none"
+            raise UsageError(f"{where}: there is no section [streams.{name}]; there are {there}")
+        outlets = {opening.value for opening in chip.openings if opening.kind == "outlet"}
+        reason = ""
+        if len(outlets) > 1:
+            reason = "its outlets have different pressures"
+        elif chip.law is not None:
+            reason = "the viscosity of its fluid depends on the flow"
+        elif inertia:
+            speeds = [opening.value * opening.width_px for opening in chip.openings if opening.kind == "inlet"]
+            area_um2_s = max(speeds, default=0.0) * chip.um_per_px
+            reynolds = 1e-9 * area_um2_s * chip.density_kg_m3 / chip.viscosity_mpa_s
+            reason = f"its fluid has inertia (Reynolds number {reynolds:.2g})" if reynolds > _REYNOLDS else ""
+        if reason:
+            raise UsageError(f"{where}: the flow of chip '{chip.name}' is not proportional to its pump's: {reason}")
+
+    def follow(self, last: Tick, tick: Tick) -> PumpShare | None:
+        """The share of this tick; None before the first sample. Of a stream that is silent the last value stays."""
+        if not self.channel:
+            return None
+        known, previous = self._measurement(last, tick), last.extra.get(PUMP)
+        if not isinstance(previous, PumpShare):
+            return None if known is None else PumpShare(tick.stamp_ns, *(known[1][-1],) * 3, int(known[0][-1]))
+        share, sample_ns = previous.share, previous.sample_ns
+        for time_ns, value in zip(*known, strict=True) if known is not None else ():
+            share += (value - share) * _weight(seconds(int(time_ns) - sample_ns), self.smoothing_s)
+            sample_ns = max(int(time_ns), sample_ns)
+        dt_s = seconds(tick.stamp_ns - previous.stamp_ns)
+        slow = previous.slow_share + (share - previous.slow_share) * _weight(dt_s, _SLOW_S)
+        # The share is that much behind already.
+        filter_s = max(_filter_s(last) - self.delay_s, 0.0)
+        observed = previous.observed_share + (share - previous.observed_share) * _weight(dt_s, filter_s)
+        return PumpShare(tick.stamp_ns, float(share), float(slow), float(observed), sample_ns)
+
+    def _measurement(self, last: Tick, tick: Tick) -> tuple[np.ndarray, np.ndarray] | None:
+        """Times and values, over the nominal one, of the samples of this tick; None without any."""
+        samples, states = tick.extra.get(SAMPLES), tick.extra.get(STREAMS)
+        if not isinstance(samples, Samples) or not isinstance(states, StreamStates):
+            return None
+        if samples is last.extra.get(SAMPLES) or self.channel not in (names := states.channel_names()):
+            return None
+        mine = (samples.channel == names.index(self.channel)) & np.isfinite(samples.value)
+        if not mine.any():
+            return None
+        return samples.sample_ns[mine] - round(self.delay_s * NS_PER_S), samples.value[mine] / self.nominal
+
+    def at_nominal(self, before: Observations | None, now: Observations | None, pump: PumpShare) -> Observations | None:
+        """Observations whose newest one is that of the nominal flow; those before it are already."""
+        if now is None or now is before:
+            return now
+        share = pump.observed_share
+        if share < _LEAST:
+            return before
+        newest = now.only(slice(-1, None))
+        error_um_s = self.error_share * float(np.hypot(*newest.flow_um_s[0]))
+        newest = replace(
+            newest,
+            flow_um_s=newest.flow_um_s / share,
+            std_um_s=np.hypot(newest.std_um_s, error_um_s) / share,
+            rolled_um_s=None if newest.rolled_um_s is None else newest.rolled_um_s / share,
+        )
+        return newest if len(now.std_um_s) == 1 else now.only(slice(None, -1)).followed_by(newest)
+
+
+def _weight(dt_s: float, memory: float) -> float:
+    """Weight of a new value in an exponential mean."""
+    return 1.0 - math.exp(-max(dt_s, 0.0) / memory) if memory > 0.0 else 1.0
+
+
+def _filter_s(last: Tick) -> float:
+    """Memory of the filter from whose estimates the observations are taken."""
+    estimate: Estimate | None = last.mapless if last.mapless is not None else last.estimate
+    return 0.0 if estimate is None else min(memory_s(estimate.covariance), _SLOW_S)
+
+
+@functools.lru_cache(maxsize=2)
+def at_share(flow: FlowField, share: float) -> FlowField:
+    """A flow at a share of its speed everywhere."""
+    share32 = np.float32(share)
+    return replace(
+        flow,
+        velocity_um_s=flow.velocity_um_s * share32,
+        pressure_pa=flow.pressure_pa * share32,
+        std_um_s=None if flow.std_um_s is None else flow.std_um_s * share32,
+    )
+
+
+def at_pump(flow: FlowField | None, pump: PumpShare | None) -> FlowField | None:
+    """A map as the pump drives it now."""
+    return flow if flow is None or pump is None else at_share(flow, pump.share)
+
+
+def as_planned(tick: Tick) -> Tick:
+    """The tick of an order with its maps at the slow mean of the pump's flow: for routes."""
+    pump = tick.extra.get(PUMP)
+    if not isinstance(pump, PumpShare):
+        return tick
+    assumed, refined = (
+        None if each is None else at_share(each, pump.slow_share) for each in (tick.assumed, tick.refined)
+    )
+    return replace(tick, assumed=assumed, refined=refined)

@@ -1,0 +1,127 @@
+"""The flow of a map follows a measured pump: by the right factor, at the right time, only where that is the flow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.core.errors import UsageError
+from flowrec.core.messages import PUMP, SAMPLES, STREAMS, Observations, PumpShare, Samples, StreamStates
+from flowrec.core.topics import Tick
+from flowrec.core.units import NS_PER_S
+from flowrec.physics.chip.chip import Chip, Opening
+from flowrec.physics.chip.fluid import PowerLaw
+from flowrec.physics.flow.solver import FlowSolver
+from flowrec.stages.estimation.pump import PumpFollower, as_planned, at_share
+
+STEP_S = 0.04
+
+
+def channel(*values: float) -> Chip:
+    """A straight channel from the left to the right with these outlet pressures in Pa, or one."""
+    mask = np.zeros((20, 60), bool)
+    mask[6:14] = True
+    if len(values) == 2:
+        mask[:6, 28:32] = True
+    outlets = [Opening("right", 6, 13, "outlet", values[0] if values else 0.0)]
+    outlets += [Opening("top", 28, 31, "outlet", values[1])] if len(values) == 2 else []
+    return Chip("channel", mask, 10.0, (Opening("left", 6, 13, "inlet", 200.0), *outlets), 1.0, 1000.0)
+
+
+def flown(pump: PumpFollower, measured: list[float]) -> list[PumpShare | None]:
+    """The share at each tick, with one sample a tick, taken at the tick."""
+    states = StreamStates(
+        0,
+        "pump",
+        "pump/other\npump/flow",
+        "\nul/min",
+        *(np.ones(1, np.int32), *(np.zeros(1, np.int64),) * 5),
+        *(np.zeros(1),) * 3,
+    )
+    last, shares = Tick(), list[PumpShare | None]()
+    for number, value in enumerate(measured):
+        stamp = round(number * STEP_S * NS_PER_S)
+        new: dict[str, object] = {STREAMS: states}
+        if np.isfinite(value):
+            place, times = np.array([0, 1], np.int32), np.array([stamp, stamp])
+            new[SAMPLES] = Samples(stamp, place, times, np.array([99.0, value]), np.array([99.0, value]))
+        tick = Tick(stamp, extra=last.extra.with_messages(new))  # type: ignore[arg-type]
+        share = pump.follow(last, tick)
+        shares.append(share)
+        last = tick if share is None else replace(tick, extra=tick.extra.with_messages({PUMP: share}))
+    return shares
+
+
+def test_the_share_is_the_measured_value_over_the_nominal_one() -> None:
+    found = flown(PumpFollower("pump/flow", nominal=12.0, smoothing_s=0.0), [12.0, 12.0, 18.0, 6.0])
+    assert [each.share for each in found if each] == pytest.approx([1.0, 1.0, 1.5, 0.5])
+
+
+def test_a_mean_over_samples_settles_with_its_memory_and_the_slow_mean_later() -> None:
+    found = flown(PumpFollower("pump/flow", smoothing_s=0.2), [1.0] + [2.0] * 50)
+    times = STEP_S * np.arange(51)
+    assert [each.share for each in found if each] == pytest.approx(2.0 - np.exp(-times / 0.2))
+    assert 1.2 < found[-1].slow_share < 1.5  # type: ignore[union-attr]
+
+
+def test_of_a_silent_stream_the_last_value_stays_and_before_the_first_there_is_none() -> None:
+    found = flown(PumpFollower("pump/flow", smoothing_s=0.0), [np.nan, 1.3, np.nan, np.nan])
+    assert found[0] is None and [each.share for each in found if each] == pytest.approx([1.3] * 3)
+    assert len({each.sample_ns for each in found if each}) == 1
+    assert flown(PumpFollower(), [1.0, 2.0]) == [None, None]
+
+
+def test_the_time_that_a_sample_tells_of_lies_the_delay_before_it() -> None:
+    found = flown(PumpFollower("pump/flow", delay_s=0.5), [1.0, 1.0])
+    assert found[1].sample_ns == round((STEP_S - 0.5) * NS_PER_S)  # type: ignore[union-attr]
+
+
+def test_a_scaled_field_is_that_of_the_scaled_boundary_values() -> None:
+    chip, solver = channel(), FlowSolver(convection=False)
+    faster = replace(chip, openings=tuple(replace(each, value=1.3 * each.value) for each in chip.openings))
+    of_share, solved = at_share(solver.solve(chip), 1.3), solver.solve(faster)
+    assert of_share.velocity_um_s == pytest.approx(solved.velocity_um_s, rel=1e-5, abs=1e-3)
+    assert of_share.pressure_pa == pytest.approx(solved.pressure_pa, rel=1e-5, abs=1e-7)
+
+
+def test_an_observation_is_that_of_the_nominal_flow_with_the_error_of_the_pump_in_it() -> None:
+    one = Observations(1, np.zeros((1, 2)), np.array([[130.0, 0.0]]), np.array([5.0]), np.array([[26.0, 0.0]]))
+    pump = PumpShare(2, 1.6, 1.0, 1.3, 0)
+    first = PumpFollower("pump/flow", error_share=0.1).at_nominal(None, one, pump)
+    assert first is not None and first.flow_um_s.tolist() == [[100.0, 0.0]] and first.rolled_um_s is not None
+    assert first.std_um_s == pytest.approx([np.hypot(5.0, 13.0) / 1.3]) and first.rolled_um_s.tolist() == [[20.0, 0.0]]
+    both = PumpFollower("pump/flow").at_nominal(first, first.followed_by(replace(one, stamp_ns=2)), pump)
+    assert both is not None and both.flow_um_s.tolist() == [[100.0, 0.0], [100.0, 0.0]]  # the first only once
+    assert PumpFollower("pump/flow").at_nominal(both, both, pump) is both
+    still = replace(pump, observed_share=0.0)
+    assert PumpFollower("pump/flow").at_nominal(first, both, still) is first
+
+
+def test_routes_are_planned_with_the_slow_mean_of_the_pump() -> None:
+    flow = FlowSolver(convection=False).solve(channel())
+    tick = Tick(1, assumed=flow)
+    planned = as_planned(replace(tick, extra=tick.extra.with_messages({PUMP: PumpShare(1, 3.0, 1.5, 1.0, 0)})))
+    assert planned.assumed is not None
+    assert planned.assumed.velocity_um_s == pytest.approx(1.5 * flow.velocity_um_s)
+    assert as_planned(tick) is tick
+
+
+@pytest.mark.parametrize(
+    ("chip", "streams", "complaint"),
+    [
+        (channel(), ("scale",), r"there is no section \[streams\.pump\]; there are scale"),
+        (channel(0.0, 5.0), ("pump",), "its outlets have different pressures"),
+        (replace(channel(), law=PowerLaw(0.6)), ("pump",), "the viscosity of its fluid depends on the flow"),
+        (replace(channel(), viscosity_mpa_s=1e-3), ("pump",), r"has inertia \(Reynolds number 16\)"),
+    ],
+)
+def test_a_flow_that_does_not_follow_its_pump_by_a_factor_is_refused(
+    chip: Chip, streams: tuple[str, ...], complaint: str
+) -> None:
+    pump = PumpFollower("pump/flow")
+    with pytest.raises(UsageError, match=complaint):
+        pump.refuse_unfit(chip, streams, inertia=True)
+    pump.refuse_unfit(channel(), ("pump",), inertia=True)
+    PumpFollower().refuse_unfit(chip, (), inertia=True)
