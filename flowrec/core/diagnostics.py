@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from flowrec.core.declarations import Message
+from flowrec.core.declarations import Message, NanFloat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +21,31 @@ class Timing(Message):
     total_ms: Annotated[float, "wall time of the whole tick"]
     queue_mb: Annotated[float, "data that waits for the disk"]
     dropped_frames: Annotated[int, "images not recorded so far"]
+    apply_ms: Annotated[NanFloat, "part of control_ms until the amplifier has the command; NaN: not stated"] = math.nan
+    arrival_ms: Annotated[
+        NanFloat, "from the middle of the exposure to the arrival of the image; NaN: no camera, or not stated"
+    ] = math.nan
+    wait_ms: Annotated[NanFloat, "from the arrival of the image to the begin of the tick; NaN: not stated"] = math.nan
+    field_ms: Annotated[
+        NanFloat,
+        "from a command at the amplifier to the field that it asks for, by the log of the outputs; of the latest one "
+        "of which it is known, NaN before it",
+    ] = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Delays:
+    """What a rig of devices knows of its delays, for `Timing`; NaN: it does not know.
+
+    Attributes
+    ----------
+    arrival_ms, field_ms : as of Timing.
+    arrived_ns : of the image, on the host's monotonic clock; None: there is no image.
+    """
+
+    arrival_ms: float
+    arrived_ns: int | None
+    field_ms: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

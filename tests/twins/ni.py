@@ -26,7 +26,7 @@ from nidaqmx._stubs import nidaqmx_pb2 as pb
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
 from flowrec.core.system.processes import Priority, prioritise_process
-from tests.twins.firmware import SAMPLE
+from flowrec.rigs.emulated.coils import SAMPLE
 
 DEVICE, OUTPUTS, RANGE_V, MAX_RATE_HZ = "cDAQ1Mod1", 4, 10.0, 100_000.0
 _STEP_S = 0.001

@@ -11,6 +11,7 @@ them.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,7 +21,7 @@ from functools import partial
 
 import numpy as np
 
-from flowrec.core import Applied, CameraLosses, Currents, Fit, Frame, Image, RigError, UsageError, nanoseconds
+from flowrec.core import Applied, CameraLosses, Currents, Delays, Fit, Frame, Image, RigError, UsageError, nanoseconds
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import CAUSES, Captured, Grabber
 from flowrec.rigs.lab.drive import BEAT_S, Drive
@@ -156,7 +157,7 @@ class LabRig:
             applied = self._field_between(session, stamp_ns, before_ns)
             applied = replace(applied, absent_until_ns=absent_until_ns)
             if frame is None:
-                yield Inputs(stamp_ns, None, applied)
+                yield Inputs(stamp_ns, None, applied, delays=self._delays())
             else:
                 losses, before = session.losses(frame.losses), losses
                 if losses is not before:  # about once a second
@@ -167,6 +168,7 @@ class LabRig:
                     applied,
                     clock=session.fit(frame.clock),
                     losses=losses,
+                    delays=self._delays(frame),
                 )
             before_ns = stamp_ns
             frame = self._next(grabber)
@@ -239,7 +241,14 @@ class LabRig:
 
     def _absent_ns(self, session: _Session) -> int:
         """Stamp of a tick without an image: before that of a frame whose exposure has begun."""
-        return session.stamp_ns(time.monotonic_ns() - nanoseconds(self._config.camera.exposure_s + BEAT_S))
+        late_s = self._config.camera.exposure_s + self._config.lab.camera_delay_s + BEAT_S
+        return session.stamp_ns(time.monotonic_ns() - nanoseconds(late_s))
+
+    def _delays(self, frame: Captured | None = None) -> Delays:
+        field_ms = self.drive.field_ms if self.drive is not None else math.nan
+        if frame is None:
+            return Delays(math.nan, None, field_ms)
+        return Delays(1e-6 * (frame.arrival_ns - frame.stamp_ns), frame.arrival_ns, field_ms)
 
     # ---- the coils
 
