@@ -84,7 +84,7 @@ def compiled_firmware(folder: Path, timer_ms: int = 100) -> Path:
         raise RigError("the emulated amplifier is the firmware, compiled: no C++ compiler here; sudo apt install g++")
     made = program.with_name(f"{program.name}.{os.getpid()}")
     options = ["-Wall", "-Wextra", "-Werror", "-O1", f"-DTIMER_MS={timer_ms}", "-DPWM_FULL=1000000", f"-I{_COMPUTER}"]
-    files = ["-include", _COMPUTER / "Arduino.h", "-x", "c++", SKETCH, _COMPUTER / "arduino.cpp"]
+    files: list[str | Path] = ["-include", _COMPUTER / "Arduino.h", "-x", "c++", SKETCH, _COMPUTER / "arduino.cpp"]
     command: list[str | Path] = [found, *options, *files, "-o", made]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own firmware
     if done.returncode:
