@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from flowrec.core import TOML, Output, UsageError, say, settings_of
+from flowrec.core import TOML, Output, say, settings_of
 from flowrec.measure import as_toml
 from flowrec.physics import load_chip
 from flowrec.rigs import EmulatedCamera, compiled_firmware, emulated_board, emulated_world
@@ -62,7 +62,7 @@ def emulated_lab(
     Parameters
     ----------
     camera_delay_s : from the end of an exposure until its image is sent.
-    sets : settings that differ from those of the emulated lab, of its world (simulated.*) too.
+    sets : settings that differ from those of the emulated lab; of its world (simulated.*) and the recorder's too.
 
     Raises
     ------
@@ -71,8 +71,6 @@ def emulated_lab(
     output = Output(file, TOML, (), overwrite)
     output.check()
     given = _SETTINGS | settings_of(sets)
-    if any(key == "rig" or key.startswith("lab.") for key in given):
-        raise UsageError("--set: the devices of an emulated lab are its own; settings of [lab] are for the recorder")
     config = load_config(None, given)
     chip = load_chip(config.chip)
     resolved = resolve(config, chip)
@@ -86,7 +84,8 @@ def emulated_lab(
             EmulatedCamera(camera.width_px, camera.height_px, camera.rate_hz) as images,
             emulated_world(pipeline, resolved, board.samples, images, camera_delay_s, _AGAIN_S),
         ):
-            devices = {"lab.camera": "opencv", "lab.device": images.url, "lab.serial.port": board.port}
+            devices = {"lab.camera": "opencv", "lab.device": images.url}
+            devices |= {"lab.amplifier": "serial", "lab.serial.port": board.port}
             settings = dict(sorted((given | devices).items()))
             with output.new_file() as part:
                 part.write_text('rig = "lab"\n' + as_toml(("Devices that flowrec emulate lab runs.",), settings))
