@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
 _NOTABLE = 0.05  # relative change of the frequency by which a command can be told from that before it
-_SAME = 0.25  # of that change: so near the frequency is that of the command
+_SAME = 0.02  # likewise, within which a field is that of the command
 _STAMP_ERROR_S = 1e-3  # of the log of the outputs
 _AWAITED_S = 1.0  # a command that has not taken effect by then was replaced by another one
 BEAT_S = 0.02  # between beats, at most, while the loop waits for a frame
@@ -86,7 +86,7 @@ class Drive:
         self._commanded_s = self._on_until_s = 0.0
         self._accounted: tuple[int, int, np.ndarray] | None = None  # the last frame's times, and its turns
         self.field_ms = math.nan
-        self._awaited: tuple[int, float, float] | None = None  # a command's time, its frequency and that before it
+        self._awaited: tuple[int, float] | None = None  # time and frequency of a command whose field is to come
 
     def __enter__(self) -> Self:
         """Find the amplifier, check the limits, start the guardian. The output is at zero.
@@ -162,12 +162,12 @@ class Drive:
         return replace(result, turns=result.turns + late)
 
     def _look_for_field(self, log: FieldLog) -> None:
-        """Find when the awaited command took effect: its frequency differs from that before it."""
+        """Find when the awaited command took effect, by its frequency, which differs from that before it."""
         if self._awaited is None:
             return
-        sent_ns, frequency_hz, before_hz = self._awaited
+        sent_ns, frequency_hz = self._awaited
         first = int(np.searchsorted(log.times_ns, sent_ns - nanoseconds(_STAMP_ERROR_S)))
-        there = np.abs(log.frequency_hz[first:] - frequency_hz) < _SAME * abs(frequency_hz - before_hz)
+        there = np.abs(log.frequency_hz[first:] - frequency_hz) < _SAME * frequency_hz
         if there.any():
             self.field_ms = max(1e-6 * float(log.times_ns[first + int(np.argmax(there))] - sent_ns), 0.0)
             self._awaited = None
@@ -201,7 +201,7 @@ class Drive:
         before_hz = self._command.frequency_hz if self._command.amplitude_mt > 0.0 else 0.0
         changes = abs(command.frequency_hz - before_hz) > _NOTABLE * command.frequency_hz
         if self._awaited is None and command.amplitude_mt > 0.0 and changes:
-            self._awaited = (time.monotonic_ns(), command.frequency_hz, before_hz)
+            self._awaited = (time.monotonic_ns(), command.frequency_hz)
         if command.amplitude_mt > 0.0:
             self._on_until_s = float("inf")
         elif self._command.amplitude_mt > 0.0:
