@@ -212,7 +212,7 @@ def test_the_command_starts_devices_that_the_doctor_finds_ready_and_ends_them_wi
             said = "".join(process.communicate(timeout=60.0))
     assert status == 0, findings
     texts = {each["what"]: each["text"] for each in findings if each["level"] == "ok"}
-    assert "320 x 256 pixels" in texts["camera"] and "goes to zero by itself after 0.1 s" in texts["coils"]
+    assert "320 x 256 pixels" in texts["camera"] and "goes to zero by itself after 0.1 s" in texts["amplifier"]
     assert process.returncode == 130 and "Traceback" not in said
     assert f"flowrec record {file}" in said
     assert not file.exists()
