@@ -35,7 +35,7 @@ class Timing(Message):
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """What a rig of devices knows of its delays, for `Timing`; NaN: it does not know.
+    """Delays that a rig of devices knows, for `Timing`; NaN: it does not know.
 
     Attributes
     ----------

@@ -66,7 +66,7 @@ def _mat_columns(path: Path) -> _Columns:
     try:
         found = loadmat(path, squeeze_me=False, struct_as_record=True)
     except (MatReadError, ValueError, TypeError, OSError, EOFError, NotImplementedError, KeyError, IndexError) as error:
-        raise _damaged(path, error) from error
+        raise _reading_error(path, error) from error
     variables = {name: value for name, value in found.items() if not name.startswith("__")}
     groups: dict[str, Mapping[str, Any]] = {"": variables}
     for name, value in variables.items():
@@ -94,7 +94,7 @@ def _mat73_columns(path: Path) -> _Columns:
             structs = {name: each for name, each in file.items() if isinstance(each, h5py.Group)}
             groups |= {name: values(each) for name, each in structs.items() if not name.startswith("#")}
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise _damaged(path, error) from error
+        raise _reading_error(path, error) from error
     return _longest(path, groups)
 
 
@@ -141,7 +141,7 @@ def _xdf_columns(path: Path) -> _Columns:
     try:
         streams, _ = pyxdf.load_xdf(str(path))
     except Exception as error:  # of a damaged file the library raises what happens
-        raise _damaged(path, error) from error
+        raise _reading_error(path, error) from error
     numeric = [each for each in streams if isinstance(each["time_series"], np.ndarray) and len(each["time_stamps"])]
     if not numeric:
         raise UsageError(
@@ -174,7 +174,7 @@ def _labels(stream: Any) -> list[str]:
     return labels if len(labels) == count else [f"{name}_{number}" for number in range(1, count + 1)]
 
 
-def _damaged(path: Path, error: Exception) -> UsageError:
+def _reading_error(path: Path, error: Exception) -> UsageError:
     said = " ".join(str(error).split())[:200]
     return UsageError(f"{path}: can not be read ({said or type(error).__name__}); save it again, or as CSV")
 

@@ -37,7 +37,7 @@ _BEGIN_S = 60.0  # for the first image
 
 
 class Rolled:
-    """How far the field has rolled a robot on the floor, by the outputs of an amplifier as they come.
+    """Turns by which the field has rolled a robot on the floor, by the outputs of an amplifier as they come.
 
     B = z cos(theta) + h sin(theta) turns by dtheta = (B x dB)/B^2 about z x h.
 
