@@ -12,7 +12,7 @@ import socket
 import threading
 from typing import Self
 
-from flowrec.core import Image
+from flowrec.core import Image, Priority, realtime_priority
 
 _HELD = 2  # images that wait for a slow client before others are thrown away
 
@@ -94,6 +94,7 @@ class _Client:
         return True
 
     def close(self) -> None:
+        """End the thread and the connection."""
         with self._changed:
             self.alive = False
             self._changed.notify()
@@ -102,6 +103,7 @@ class _Client:
         self._thread.join()
         self._connection.close()
 
+    @realtime_priority(Priority.GUARDIAN)  # a camera does not wait for the computer's other work
     def _write(self) -> None:
         while True:
             with self._changed:

@@ -255,8 +255,8 @@ def test_a_mission_on_the_emulated_lab_arrives_states_its_latency_and_gives_back
     assert found.camera_delay_s is not None
     delay, error = found.camera_delay_s
     assert error < 0.006
-    # The stream itself takes up to a millisecond on the loopback.
-    assert delay == pytest.approx(delay_s + 5e-4, abs=2.0 * error + 1e-3)
+    # The stream itself takes up to a millisecond on the loopback, and more on a busy computer.
+    assert delay == pytest.approx(delay_s + 5e-4, abs=3.0 * error + 3e-3)
     # Stamps are late by the delay of the camera, which the chain does not know as long as no setting states it.
     expected_s = delay_s + 1e-3 * middle[-1]
     assert found.sets["robot.delay_s"] == pytest.approx(expected_s, abs=0.008)
