@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from flowrec.core.declarations import Message, NanFloat
+from flowrec.core.declarations import Message
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,21 +20,21 @@ class Timing(Message):
     total_ms: Annotated[float, "wall time of the whole tick"]
     queue_mb: Annotated[float, "data that waits for the disk"]
     dropped_frames: Annotated[int, "images not recorded so far"]
-    apply_ms: Annotated[NanFloat, "part of control_ms until the amplifier has the command; NaN: not stated"] = math.nan
+    apply_ms: Annotated[float | None, "part of control_ms until the amplifier has the command; None: not stated"] = None
     arrival_ms: Annotated[
-        NanFloat, "from the middle of the exposure to the arrival of the image; NaN: no camera, or not stated"
-    ] = math.nan
-    wait_ms: Annotated[NanFloat, "from the arrival of the image to the begin of the tick; NaN: not stated"] = math.nan
+        float | None, "from the middle of the exposure to the arrival of the image; None: no camera, or not stated"
+    ] = None
+    wait_ms: Annotated[float | None, "from the arrival of the image to the begin of the tick; None: not stated"] = None
     field_ms: Annotated[
-        NanFloat,
+        float | None,
         "from a command at the amplifier to the field that it asks for, by the log of the outputs; of the latest one "
-        "of which it is known, NaN before it",
-    ] = math.nan
+        "of which it is known, None before it",
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """Delays that a rig of devices knows, for `Timing`; NaN: it does not know.
+    """Delays that a rig of devices knows, for `Timing`; None: it does not know.
 
     Attributes
     ----------
@@ -43,9 +42,9 @@ class Delays:
     arrived_ns : of the image, on the host's monotonic clock; None: there is no image.
     """
 
-    arrival_ms: float
+    arrival_ms: float | None
     arrived_ns: int | None
-    field_ms: float
+    field_ms: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

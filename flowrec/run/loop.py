@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -218,12 +217,12 @@ def run(
     return report
 
 
-def _delays_of(inputs: Inputs) -> dict[str, float]:
+def _delays_of(inputs: Inputs) -> dict[str, float | None]:
     """Those of a tick that begins now, for its `Timing`; none of a rig that does not tell."""
     told = inputs.delays
     if told is None:
         return {}
-    waited_ms = math.nan if told.arrived_ns is None else 1e-6 * (time.monotonic_ns() - told.arrived_ns)
+    waited_ms = None if told.arrived_ns is None else 1e-6 * (time.monotonic_ns() - told.arrived_ns)
     return {"arrival_ms": told.arrival_ms, "wait_ms": waited_ms, "field_ms": told.field_ms}
 
 

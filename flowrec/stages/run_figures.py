@@ -30,10 +30,11 @@ CHAIN = ("arrived", "tracked", "commanded", "on the wire", "field")  # stages of
 
 def chain_ms(timing: Timing) -> tuple[float, ...]:
     """Time in ms from the middle of the exposure to each stage of CHAIN; NaN: not known."""
-    arrived = timing.arrival_ms
-    tracked = arrived + timing.wait_ms + timing.track_ms
+    told = timing.arrival_ms, timing.wait_ms, timing.apply_ms, timing.field_ms
+    arrived, waited, applied, field = (math.nan if each is None else each for each in told)
+    tracked = arrived + waited + timing.track_ms
     wire = tracked + timing.observe_ms + timing.control_ms
-    return arrived, tracked, wire - timing.apply_ms, wire, wire + timing.field_ms
+    return arrived, tracked, wire - applied, wire, wire + field
 
 
 class RunStatistics:
@@ -60,7 +61,7 @@ class RunStatistics:
         self.true_field = tick.true_field or self.true_field
         if tick.truth is not None:
             self.contacts = tick.truth.contacts
-        if tick.timing is not None and math.isfinite(tick.timing.arrival_ms):
+        if tick.timing is not None and tick.timing.arrival_ms is not None:
             self._chain_ms.append(chain_ms(tick.timing))
         demand = tick.demand
         if tick.mission is None or tick.mission.phase != Phase.NAVIGATE:

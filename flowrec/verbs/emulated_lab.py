@@ -33,6 +33,7 @@ _SETTINGS: dict[str, Any] = {
     "lab.camera_timeout_s": 0.5,
     "safety.guard_timeout_s": 1.5,
 }
+_TIMER_MS = 300  # of the firmware, for the same reason
 _AGAIN_S = 3.0  # without a field: the mission is over
 _SLICE_S = 0.5
 
@@ -82,7 +83,7 @@ def emulated_lab(
     camera = resolved.camera
     say("compiling the firmware and solving the true flow")
     with TemporaryDirectory(prefix="flowrec-lab-") as folder:
-        program = compiled_firmware(Path(folder))
+        program = compiled_firmware(Path(folder), _TIMER_MS)
         with (
             emulated_board(program, Path(folder) / "outputs") as board,
             EmulatedCamera(camera.width_px, camera.height_px, camera.rate_hz) as images,

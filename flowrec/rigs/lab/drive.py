@@ -11,7 +11,6 @@ Times are those of the host's monotonic clock.
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -55,7 +54,7 @@ class Drive:
     ----------
     info : what the amplifier says of itself, inside of the context.
     field_ms : from the latest command of another frequency to the field that it asks for, by the log of the outputs;
-        NaN before there was one.
+        None before there was one.
     """
 
     @classmethod
@@ -85,7 +84,7 @@ class Drive:
         self._command = _REST
         self._commanded_s = self._on_until_s = 0.0
         self._accounted: tuple[int, int, np.ndarray] | None = None  # the last frame's times, and its turns
-        self.field_ms = math.nan
+        self.field_ms: float | None = None
         self._awaited: tuple[int, float] | None = None  # time and frequency of a command whose field is to come
 
     def __enter__(self) -> Self:

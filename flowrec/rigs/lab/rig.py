@@ -11,7 +11,6 @@ them.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
@@ -245,9 +244,9 @@ class LabRig:
         return session.stamp_ns(time.monotonic_ns() - nanoseconds(late_s))
 
     def _delays(self, frame: Captured | None = None) -> Delays:
-        field_ms = self.drive.field_ms if self.drive is not None else math.nan
+        field_ms = self.drive.field_ms if self.drive is not None else None
         if frame is None:
-            return Delays(math.nan, None, field_ms)
+            return Delays(None, None, field_ms)
         return Delays(1e-6 * (frame.arrival_ns - frame.stamp_ns), frame.arrival_ns, field_ms)
 
     # ---- the coils

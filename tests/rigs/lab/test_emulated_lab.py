@@ -155,11 +155,11 @@ class NoGuardian:
 @pytest.mark.parametrize("late_ms", [2.0, 60.0])
 def test_the_time_from_a_command_to_its_field_is_that_of_the_amplifier(late_ms: float) -> None:
     """With commands that come faster than their fields: each is found by its frequency."""
-    found: list[float] = []
+    found: list[float | None] = []
     limits = CommandLimits(COILS, ROBOT, OUTPUT)
     with Drive(Late(1e-3 * late_ms), limits, 1.0, 5.0, guardian=NoGuardian) as drive:  # type: ignore[arg-type]
         before_ns = None
-        assert math.isnan(drive.field_ms)
+        assert drive.field_ms is None
         for number in range(40):
             command: Currents = currents(3.0 * 1.08 ** (5 * number % 12), 0.1 * number)
             drive.apply(command)
@@ -168,7 +168,7 @@ def test_the_time_from_a_command_to_its_field_is_that_of_the_amplifier(late_ms: 
             before_ns = now_ns
             found.append(drive.field_ms)
             time.sleep(0.01)
-    known = np.array([each for each in found if not math.isnan(each)])
+    known = np.array([each for each in found if each is not None])
     assert len(known) > 20
     assert np.quantile(known, (0.2, 0.8)) == pytest.approx([late_ms] * 2, abs=1.0)
 
@@ -178,7 +178,7 @@ def test_the_chain_of_latency_is_the_sum_of_its_stages_and_is_told_with_median_a
     for number in range(400):
         track_ms = 1.0 + float(rng.uniform(0.0, 1.0))
         control = {"observe_ms": 0.5, "control_ms": 1.25, "apply_ms": 0.25}
-        delays = {"arrival_ms": 10.0, "wait_ms": 2.0, "field_ms": math.nan if number < 10 else 40.0}
+        delays = {"arrival_ms": 10.0, "wait_ms": 2.0, "field_ms": None if number < 10 else 40.0}
         timing = Timing(
             number, track_ms, sinks_ms=0.0, total_ms=0.0, queue_mb=0.0, dropped_frames=0, **control, **delays
         )
@@ -213,7 +213,7 @@ def test_the_command_starts_devices_that_the_doctor_finds_ready_and_ends_them_wi
             said = "".join(process.communicate(timeout=60.0))
     assert status == 0, findings
     texts = {each["what"]: each["text"] for each in findings if each["level"] == "ok"}
-    assert "320 x 256 pixels" in texts["camera"] and "goes to zero by itself after 0.1 s" in texts["amplifier"]
+    assert "320 x 256 pixels" in texts["camera"] and "goes to zero by itself after 0.3 s" in texts["amplifier"]
     assert process.returncode == 130 and "Traceback" not in said
     assert f"flowrec record {file}" in said
     assert not file.exists()
