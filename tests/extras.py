@@ -10,6 +10,7 @@ import pytest
 EXTRA_OF = {
     "dask": "cluster",
     "datafusion": "catalog",
+    "h5py": "movies",
     "mm_test_adapters": "dev",
     "moto": "dev",
     "nbformat": "dev",
@@ -20,6 +21,7 @@ EXTRA_OF = {
     "pylsl": "streams",
     "pymmcore_plus": "mmcore",
     "pypylon": "pylon",
+    "pyxdf": "movies",
     "skfmm": "dev",
     "viva_genicam": "genicam",
 }

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pickle
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -18,6 +20,8 @@ from flowrec.core.messages import Estimate, FlowField, Track
 from flowrec.core.ranges import Range, Seed, Share
 from flowrec.physics.chip.io import load_chip
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
+from flowrec.rigs.lab.cameras.camera import Wanted
+from flowrec.rigs.lab.cameras.grabber import Grabber
 from flowrec.rigs.lab.drive import probe_amplifier
 from flowrec.rigs.lab.guardian import Guardian
 from flowrec.rigs.simulated.rig import SimulatedRig
@@ -37,6 +41,9 @@ from flowrec.stages.vision.tracker import TRACKERS, Tracker
 from flowrec.store.session import Session
 from flowrec.verbs.record import record
 from flowrec.verbs.session_replay import replay_session
+from tests.conftest import HANG_S
+from tests.outsider.pi_law import ProportionalIntegral  # noqa: F401 - named by an entry point
+from tests.outsider.vendor_camera import AcmeCamera
 from tests.short_missions import SMALL
 
 ROOT = Path(__file__).parents[1]
@@ -237,6 +244,76 @@ def test_a_name_of_ours_can_not_be_taken(entries: dict[str, dict[str, str]]) -> 
     ]
     with pytest.raises(UsageError, match=r"kit0 2, and the section plan\.swift of its settings is taken"):
         load_config(None, ["plan.method=swift"])
+
+
+@pytest.mark.slow("flies a mission and replays it")
+def test_a_controller_of_a_lab_with_an_integral_arrives_and_replays_exactly_from_the_middle(
+    entries: dict[str, dict[str, str]], tmp_path: Path
+) -> None:
+    """Where the integral is kept in a message: without it the demands after a restart would be others."""
+    entries["flowrec.controllers"] = {"pi": "ProportionalIntegral"}
+    recorded = record(load_config(None, [*SMALL, "control.method=pi", "control.pi.ki_per_s2=4"]), tmp_path / "a.mcap")
+    assert recorded.facts["outcome"] == "reached"
+    assert recorded.facts["contacts"] == 0
+    assert replay_session(recorded.path, from_s=5.0, verify=True).identical
+
+
+class _Acme(ModuleType):
+    """A vendor's package with one camera, whose images and faults are listed."""
+
+    class AcmeError(Exception):
+        pass
+
+    class NoImage(AcmeError):  # noqa: N818 - as vendors name them
+        pass
+
+    model, serial, overruns, rate_hz, exposure_us = "A1", "7", 0, 50.0, 4000.0
+    region = (8, 6)
+
+    def __init__(self, steps: list[Any]) -> None:
+        super().__init__("acme_sdk")
+        self.steps, self.begun = steps, 0
+        self.memory = np.zeros((6, 8), np.uint8)  # of which each image is a view
+
+    def connect(self, device: str | None, buffers: int) -> _Acme:
+        assert (device, buffers) == (None, 4)
+        return self
+
+    def start(self) -> None:
+        self.begun += 1
+
+    def next_image(self, timeout_ms: float) -> Any:
+        step = self.steps.pop(0) if self.steps else None
+        if step is None:
+            time.sleep(1e-3 * timeout_ms)
+            raise self.NoImage
+        if isinstance(step, Exception):
+            raise step
+        self.memory[:] = step
+        return SimpleNamespace(pixels=self.memory, number=step, stamp_us=20_000 * step, damaged=step == 5)
+
+    def ping(self) -> bool:
+        return True
+
+    def stop(self) -> None:
+        pass
+
+
+def test_a_camera_by_the_package_of_its_vendor_is_counted_and_opened_again_like_ours(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    acme = _Acme([1, 2, 4, 5, 6, _Acme.AcmeError("unplugged"), 7, 8])
+    monkeypatch.setitem(sys.modules, "acme_sdk", acme)
+    wanted = Wanted(width_px=8, height_px=6, rate_hz=50.0, settings=AcmeCamera.Settings(buffers=4))
+    with Grabber(lambda: AcmeCamera.of(wanted), wanted, 100) as grabber:
+        frames = [grabber.next(HANG_S) for _ in range(6)]
+        assert grabber.info.name == "A1 7"
+    assert [int(frame.image[0, 0]) for frame in frames if frame] == [1, 2, 4, 6, 7, 8], "copies, none of a damaged one"
+    losses = frames[-1].losses
+    assert (losses.link, losses.incomplete, losses.reconnections, acme.begun) == (1, 1, 1, 2)
+    assert frames[1].clock is not None, "stamps are by the camera's clock"
+    with pytest.raises(RigError, match="knows no trigger"):
+        AcmeCamera.of(replace(wanted, trigger="Line1")).open()
 
 
 @pytest.mark.slow("flies a mission and replays it")

@@ -21,7 +21,7 @@ from .declared_topics import (
     declaration as declaration, declared_topic as declared_topic, message_of as message_of,
     remember_call as remember_call,
 )
-from .diagnostics import CameraLosses as CameraLosses, Clocks as Clocks, Drops as Drops, Timing as Timing
+from .diagnostics import CameraLosses as CameraLosses, Clocks as Clocks, Delays as Delays, Drops as Drops, Timing as Timing
 from .enums import (
     ALARM_WORDS as ALARM_WORDS, Action as Action, Alarm as Alarm, AxesVerdict as AxesVerdict, Level as Level, Outcome as Outcome,
     Phase as Phase, View as View, WorkOrder as WorkOrder, completes_mission as completes_mission,

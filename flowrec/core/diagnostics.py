@@ -20,6 +20,31 @@ class Timing(Message):
     total_ms: Annotated[float, "wall time of the whole tick"]
     queue_mb: Annotated[float, "data that waits for the disk"]
     dropped_frames: Annotated[int, "images not recorded so far"]
+    apply_ms: Annotated[float | None, "part of control_ms until the amplifier has the command; None: not stated"] = None
+    arrival_ms: Annotated[
+        float | None, "from the middle of the exposure to the arrival of the image; None: no camera, or not stated"
+    ] = None
+    wait_ms: Annotated[float | None, "from the arrival of the image to the begin of the tick; None: not stated"] = None
+    field_ms: Annotated[
+        float | None,
+        "from a command at the amplifier to the field that it asks for, by the log of the outputs; of the latest one "
+        "of which it is known, None before it",
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class Delays:
+    """Delays that a rig of devices knows, for `Timing`; None: it does not know.
+
+    Attributes
+    ----------
+    arrival_ms, field_ms : as of Timing.
+    arrived_ns : of the image, on the host's monotonic clock; None: there is no image.
+    """
+
+    arrival_ms: float | None
+    arrived_ns: int | None
+    field_ms: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

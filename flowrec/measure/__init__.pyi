@@ -13,4 +13,5 @@ from .calibrate_motion import (
 from .coil_windings import windings_matrix as windings_matrix
 from .motion_fit import MotionFit as MotionFit, UNEXPLAINED as UNEXPLAINED
 from .picture_registration import ImageVerdict as ImageVerdict, orientation_by_image as orientation_by_image
+from .proposal import as_toml as as_toml
 from .tuning import tune as tune

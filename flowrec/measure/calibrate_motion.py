@@ -22,11 +22,18 @@ from flowrec.core import (
     seconds,
     table,
 )
-from flowrec.measure.motion_fit import LEAST_EXPLAINED_WITH_RATE, LEAST_FRAMES, MotionFit, fit_motion, refusal_of
+from flowrec.measure.motion_fit import (
+    LEAST_EXPLAINED,
+    LEAST_EXPLAINED_WITH_RATE,
+    LEAST_FRAMES,
+    MotionFit,
+    fit_motion,
+    refusal_of,
+)
 from flowrec.measure.motion_regression import Turns
 from flowrec.measure.motion_search import SearchRange
 from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outputs
-from flowrec.stages import MOVIE, FieldCommand, FieldLog, FieldState, Floats, field_motion, read_coil_log
+from flowrec.stages import LAB, MOVIE, FieldCommand, FieldLog, FieldState, Floats, field_motion, read_coil_log
 from flowrec.store import Session, files_behind
 
 # A log on another clock: any offset, and rates of 30 % to either side.
@@ -50,6 +57,7 @@ class MotionCalibration(NamedTuple):
     advice: tuple[str, ...]
     covered: Coverage  # images in which the robot was seen, of all
     path: Path  # of the session
+    camera_delay_s: tuple[float, float] | None  # of a lab's camera, and its standard error; None: not known
     out: Path | None  # that the settings were written to
 
     def as_json(self) -> dict[str, Any]:
@@ -57,6 +65,8 @@ class MotionCalibration(NamedTuple):
         return figures_of(self.fit) | {
             "log": self.log,
             "shared_clock": self.shared_clock,
+            "camera_delay_s": None if self.camera_delay_s is None else self.camera_delay_s[0],
+            "camera_delay_standard_error_s": None if self.camera_delay_s is None else self.camera_delay_s[1],
             "advice": list(self.advice),
             "set": as_sets(self.sets),
             "covered": self.covered.as_json(),
@@ -65,6 +75,9 @@ class MotionCalibration(NamedTuple):
     def show(self) -> None:
         """Print the fit as a table, advice and settings."""
         rows = rows_of(self.fit, shared_clock=self.shared_clock)
+        if self.camera_delay_s is not None:
+            delay_ms, error_ms = (1e3 * each for each in self.camera_delay_s)
+            rows.append(("delay of the camera beyond its exposure", f"{delay_ms:.1f} ± {error_ms:.1f} ms"))
         table(f"{self.path.name} against {self.log}", ("", "value and standard error"), rows)
         for sentence in self.advice:
             say(f"- {sentence}")
@@ -106,18 +119,41 @@ def calibrate_motion(
         name = "the session's log"
     else:
         log = commanded_field(list(session.messages("currents")))
-        fit = fit_log(stamps_ns, positions, log, _ONE_CLOCK, flow, exact_log=True)
+        fit = fit_log(stamps_ns, positions, log, _ONE_CLOCK, flow, exact_log=True, own_log=True)
         name = "the session's commands"
     if fit.refusal:
         raise UsageError(f"{path}: {fit.refusal}")
     shared = coils is None and not imported
+    if shared and -fit.offset_s < -_SIGNIFICANT * fit.offset_std_s:
+        raise UsageError(
+            f"{path}: the robot moves {1e3 * fit.offset_s:.0f} ms before the commands, so it does not follow "
+            "them; does the track follow another particle?"
+        )
+    camera_delay = None
+    if shared and session.config.rig == LAB:
+        camera_delay = _camera_delay(session, stamps_ns / NS_PER_S, positions, flow)
     sets, advice = _propose_settings(fit, session, shared_clock=shared, own_log=coils is None)
+    if camera_delay is not None and camera_delay[1] < _POOR_OFFSET_S:
+        sets["lab.camera_delay_s"] = round(max(camera_delay[0], 0.0), 4)
     covered = Coverage(len(tracks), len(every), "images", "show the robot")
     if outputs:
         source = f"By flowrec {__version__} calibrate motion from {path.name} and {name}."
         comments = (source, *(f"{key}: {value}" for key, value in rows_of(fit)))
         write_outputs(outputs, (as_toml(comments, dict(sorted(sets.items()))).encode(),))
-    return MotionCalibration(fit, name, shared, sets, advice, covered, path, out)
+    return MotionCalibration(fit, name, shared, sets, advice, covered, path, camera_delay, out)
+
+
+def _camera_delay(
+    session: Session, times_s: Floats, positions_um: Floats, flow: FlowField | None
+) -> tuple[float, float] | None:
+    """Time from the end of an exposure to the arrival of its image, and its standard error; None: not determined.
+
+    The amplifier reports when the field turned, on the host's clock. An image shows the robot as it rolled with the
+    field; that its stamp is later is the camera's delay, beyond what the stamps had been corrected by.
+    """
+    turns, span_s = _applied_turns(session)
+    fit = fit_motion(times_s, positions_um, turns, span_s, _ONE_CLOCK, flow, exact_log=True, own_log=True)
+    return None if fit.refusal else (session.config.lab.camera_delay_s - fit.offset_s, fit.offset_std_s)
 
 
 def fit_log(
@@ -130,6 +166,7 @@ def fit_log(
     exact_log: bool = False,
     window: int = 1,
     log_error_s: float = 0.0,
+    own_log: bool = False,
 ) -> MotionFit:
     """Fit arrays (n,) and (n, 2), averaged over `window` frames in turn; frames left at the end are not used.
 
@@ -149,7 +186,8 @@ def fit_log(
     begin_s = seconds(begin_ns)
     span_s = (begin_s, seconds(int(log.times_ns[-1])))
     times_s = stamps_ns / NS_PER_S
-    return fit_motion(times_s, positions_um, turns, span_s, within, flow, exact_log=exact_log, log_error_s=log_error_s)
+    errors: dict[str, Any] = {"exact_log": exact_log, "log_error_s": log_error_s, "own_log": own_log}
+    return fit_motion(times_s, positions_um, turns, span_s, within, flow, **errors)
 
 
 def sampled_s(log: FieldLog, image_s: float) -> float | None:
@@ -288,6 +326,11 @@ def remarks(fit: MotionFit) -> list[str]:
         sentences.append(
             f"the offset is known to {1e3 * fit.offset_std_s:.0f} ms only; a longer movie with more changes of heading "
             "or frequency determines it better"
+        )
+    if fit.explained < LEAST_EXPLAINED:
+        sentences.append(
+            f"the commands explain {100.0 * fit.explained:.0f} % only of the changes of motion, as where each image is "
+            "stamped late by another time: use a camera with a clock, or one that states when it exposed"
         )
     if fit.left_out > 0.02 * (fit.frames + fit.left_out):
         sentences.append(f"{fit.left_out} positions were left out because the robot can not have been there")

@@ -44,6 +44,10 @@ from flowrec.stages import (
 # the offset is right to 4 ms. Measured by python -m tests.perf.alignment.
 LEAST_EXPLAINED = 0.65
 UNEXPLAINED = "is it the log of another run, or does the track follow another particle"  # where no more is known
+# Of a session and its own log on one clock nothing has to tell the log from that of another run. Images that are
+# stamped up to 25 ms late, each by another time, leave 0.5 of the 0.84 that the same motion explains with right stamps,
+# and the offset within its error; a track of another particle leaves 0.0.
+LEAST_EXPLAINED_OWN = 0.2
 LEAST_EXPLAINED_WITH_RATE = 0.75  # a rate that differs from 1 gives the log of another run one more way to fit
 LARGEST_P_VALUE = 0.01  # of the best offset in time against the null: above it none was found
 LEAST_FRAMES = 30
@@ -99,6 +103,7 @@ def fit_motion(
     *,
     exact_log: bool = False,
     log_error_s: float = 0.0,
+    own_log: bool = False,
 ) -> MotionFit:
     """Place a movie in a log.
 
@@ -110,6 +115,7 @@ def fit_motion(
     flow : known one, which carries the robot; its scale is fitted.
     exact_log : it tells what the field did; else what was commanded, which takes effect within a turn of the field.
     log_error_s : standard error of the times at which the log says that the field changed.
+    own_log : it is that of this run for certain.
 
     Raises
     ------
@@ -151,7 +157,8 @@ def fit_motion(
     late_s = math.hypot(_OFFSET_S, log_error_s)
     if not exact_log:  # a log of commands is late by a part of a revolution that differs from change to change
         late_s = math.hypot(late_s, _COMMAND_REVOLUTIONS / max(_mean_hz(track, best), 1e-3))
-    return _result(track, best, second, p_value, everything, late_s)
+    least = LEAST_EXPLAINED_OWN if own_log else LEAST_EXPLAINED
+    return _result(track, best, second, p_value, everything, late_s, least)
 
 
 def _check_track(stamps_s: ArrayLike, positions_um: ArrayLike) -> tuple[Floats, Floats]:
@@ -187,6 +194,7 @@ def _result(
     p_value: float,
     everything: Flags,
     late_s: float,
+    least: float,
 ) -> MotionFit:
     # A position from which the track comes back at once is an error of the tracker: a command acts on the velocity.
     whole = replace(track, flags=np.where(track.flags == SKIPPED, track.flags, everything))
@@ -224,7 +232,7 @@ def _result(
         frames=len(track.flags) - left_out,
         left_out=left_out,
     )
-    return fit._replace(refusal=_refusal(fit, ambiguous=ambiguous))
+    return fit._replace(refusal=_refusal(fit, least, ambiguous=ambiguous))
 
 
 def _explained_fraction(track: TrackRegression, fit: MotionRegression) -> float:
@@ -334,8 +342,8 @@ def refusal_of(fit: MotionFit, least: float) -> str:
     )
 
 
-def _refusal(fit: MotionFit, *, ambiguous: bool) -> str:
-    least = LEAST_EXPLAINED if fit.rate == 1.0 else LEAST_EXPLAINED_WITH_RATE
+def _refusal(fit: MotionFit, least: float, *, ambiguous: bool) -> str:
+    least = least if fit.rate == 1.0 else LEAST_EXPLAINED_WITH_RATE
     if fit.explained < least:
         return refusal_of(fit, least)
     if fit.p_value > LARGEST_P_VALUE or not math.isfinite(fit.offset_std_s):

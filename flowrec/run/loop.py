@@ -168,6 +168,7 @@ def run(
             inputs = _with_events(arrived, worker, control, tick, live=live)
             last = tick
             watch.start()
+            delays = _delays_of(inputs)
             try:
                 with control.interruptible:
                     tick = step(pipeline, last, inputs, watch.lap)
@@ -192,6 +193,8 @@ def run(
                 total_ms=(time.perf_counter() - begin_s) * 1e3 + sinks_ms,
                 queue_mb=queue_mb,
                 dropped_frames=dropped,
+                apply_ms=watch.ms["apply"],
+                **delays,
             )
             recorded = replace(
                 tick,
@@ -223,6 +226,15 @@ def run(
     report.last = ended
     _end(report, sinks, control, watchdog, live=live)
     return report
+
+
+def _delays_of(inputs: Inputs) -> dict[str, float | None]:
+    """Those of a tick that begins now, for its `Timing`; none of a rig that does not tell."""
+    told = inputs.delays
+    if told is None:
+        return {}
+    waited_ms = None if told.arrived_ns is None else 1e-6 * (time.monotonic_ns() - told.arrived_ns)
+    return {"arrival_ms": told.arrival_ms, "wait_ms": waited_ms, "field_ms": told.field_ms}
 
 
 def _and_afterwards(arriving: Iterator[Inputs], state: Callable[[], Tick], *, paced: bool) -> Iterator[Inputs]:

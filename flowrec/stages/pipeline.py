@@ -25,6 +25,7 @@ from flowrec.core import (
     AxesCheck,
     Background,
     CameraLosses,
+    Delays,
     Estimate,
     Extra,
     Fit,
@@ -86,6 +87,7 @@ class Inputs:
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
     losses: CameraLosses | None = None  # of the camera so far, for the record only
     measured: Measured | None = None  # currents of the coils, by an amplifier that measures them; for the record only
+    delays: Delays | None = None  # of the image and of the latest command, for the record only
     extra: Mapping[str, Message] = NO_EXTRA  # new messages of the extra topics of rig and simulator, by path
 
 
@@ -94,7 +96,7 @@ ARRIVING = tuple(topic.field for topic in TOPICS if topic.role in (Role.INPUT, R
 HELD = tuple(name for name in ARRIVING if BY_FIELD[name].source in (Source.RIG, Source.OPERATOR, Source.WORKER))
 # The results of the stages that read the image: where it was not recorded, a replay takes these.
 FROM_IMAGE = ("track", "appearance", "background", "shift")
-if {each.name for each in fields(Inputs)} != {"stamp_ns", *FROM_IMAGE, "clock", "losses", "extra", *ARRIVING}:
+if {each.name for each in fields(Inputs)} != {"stamp_ns", *FROM_IMAGE, "clock", "losses", "delays", "extra", *ARRIVING}:
     raise TypeError(f"pipeline.Inputs needs a field for each input of Tick: {', '.join(ARRIVING)}")
 
 

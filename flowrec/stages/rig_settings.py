@@ -187,6 +187,9 @@ class Lab:
     gain: Annotated[float, Range(-100.0, 1e4)] | None = None  # gain in the camera's unit; None: as the camera has it
     trigger: str = ""  # what triggers an image; '': the camera runs freely; 'software'; else the line, such as 'Line1'
     queue_frames: Annotated[int, Range(1, 1000)] = 8  # images that may wait for the loop; more are dropped and counted
+    # constant time from the end of an exposure to the arrival of its image, which no clock tells: readout, transfer,
+    # driver; flowrec calibrate motion finds it
+    camera_delay_s: Annotated[float, Range(0.0, 1.0)] = 0.0
     # time without an image after which the field is off until there is one again; less than safety.guard_timeout_s
     camera_timeout_s: Annotated[float, Range(0.01, 60.0)] = 0.3
     # time without an image after which the run ends

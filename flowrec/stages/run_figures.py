@@ -7,10 +7,34 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import FLOW_FIELDS, Demand, Figures, FlowField, Mission, Outcome, Phase, Route, Tick, finite, seconds
+from flowrec.core import (
+    FLOW_FIELDS,
+    Demand,
+    Figures,
+    FlowField,
+    Mission,
+    Outcome,
+    Phase,
+    Route,
+    Tick,
+    Timing,
+    finite,
+    seconds,
+)
 from flowrec.physics import Chip, Robot, relative_rmse
 from flowrec.stages.planning.planner import Planner
 from flowrec.stages.planning.survey_ways import METHOD as SURVEY_ROUTE
+
+CHAIN = ("arrived", "tracked", "commanded", "on the wire", "field")  # stages of the latency, after the exposure
+
+
+def chain_ms(timing: Timing) -> tuple[float, ...]:
+    """Time in ms from the middle of the exposure to each stage of CHAIN; NaN: not known."""
+    told = timing.arrival_ms, timing.wait_ms, timing.apply_ms, timing.field_ms
+    arrived, waited, applied, field = (math.nan if each is None else each for each in told)
+    tracked = arrived + waited + timing.track_ms
+    wire = tracked + timing.observe_ms + timing.control_ms
+    return arrived, tracked, wire - applied, wire, wire + field
 
 
 class RunStatistics:
@@ -27,6 +51,7 @@ class RunStatistics:
         self.true_field: FlowField | None = None
         self.contacts = 0
         self.navigating_ns: int | None = None
+        self._chain_ms: list[tuple[float, ...]] = []
         self._square_um2 = 0.0
         self._count = 0
         self._last: Demand | None = None
@@ -36,6 +61,8 @@ class RunStatistics:
         self.true_field = tick.true_field or self.true_field
         if tick.truth is not None:
             self.contacts = tick.truth.contacts
+        if tick.timing is not None and tick.timing.arrival_ms is not None:
+            self._chain_ms.append(chain_ms(tick.timing))
         demand = tick.demand
         if tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
             return
@@ -47,6 +74,15 @@ class RunStatistics:
         if math.isfinite(demand.error_um):
             self._square_um2 += demand.error_um**2
             self._count += 1
+
+    @property
+    def latency(self) -> str | None:
+        """The chain of latency as text: median and 95 % of each stage since the middle of the exposure."""
+        if not self._chain_ms:
+            return None
+        columns = [(name, row[np.isfinite(row)]) for name, row in zip(CHAIN, np.array(self._chain_ms).T, strict=True)]
+        known = [(name, *np.quantile(row, (0.5, 0.95)).tolist()) for name, row in columns if row.size]
+        return ", ".join(f"{name} {middle:.1f} ({late:.1f})" for name, middle, late in known) + " ms after the exposure"
 
     @property
     def tracking_error_um(self) -> float | None:

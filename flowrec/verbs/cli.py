@@ -27,6 +27,7 @@ from flowrec.verbs.compare import compare
 from flowrec.verbs.completion import leave_out_key
 from flowrec.verbs.cut import cut
 from flowrec.verbs.doctor import doctor
+from flowrec.verbs.emulate import emulate
 from flowrec.verbs.export import export
 from flowrec.verbs.import_movie import import_movie
 from flowrec.verbs.info import info
@@ -78,6 +79,7 @@ app = typer.Typer(
     **HELP_SETTINGS,
 )
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(emulate, name="emulate")
 app.add_typer(from_above("bench"), name="bench")
 
 

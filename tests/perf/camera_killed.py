@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from flowrec.physics.chip.io import load_chip
+from flowrec.rigs.emulated.world import emulated_world
 from flowrec.stages.config import load_config
 from flowrec.stages.pipeline import assemble
 from flowrec.stages.resolve import resolve
 from tests.twins.coils import device
 from tests.twins.gige import Aravis, port
 from tests.twins.lab import COMMON, RATE, recorder
-from tests.twins.world import FileView, live_world
+from tests.twins.world import FileView
 
 GOAL_UM = (1996.0, 3152.0)
 # A busy computer delays the loop by more than a lab's may; the camera's silence is told by the usual time.
@@ -71,7 +72,7 @@ def trial(folder: Path) -> Killed:
     with (
         port(),
         device("serial+timer", folder, timer_ms=1000) as coils,
-        live_world(assemble(resolved, chip), resolved, coils, view) as (_, truths),
+        emulated_world(assemble(resolved, chip), resolved, coils, view) as (_, truths),
         Aravis(shown=view.file) as camera,
         recorder(out, *SETS, *view.sets, *coils.sets, errors=errors) as process,
     ):

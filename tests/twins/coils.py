@@ -13,20 +13,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import pytest
 
-from tests.twins.firmware import FULL_A, compiled, firmware_twin, read_samples, sample
+from flowrec.rigs.emulated.coils import FULL_A, OutputSamples, compiled_firmware, compiler, emulated_board
 
 _ROOT = Path(__file__).parents[2]
 
 
-@dataclass(frozen=True)
-class Device:
-    """A twin with coils on it."""
+def compiled(folder: Path, timer_ms: int = 100, coils: int = 3, sensors: bool = False) -> Path:
+    """The firmware as a program; a test is skipped where nothing can compile it."""
+    if compiler() is None:
+        pytest.skip("needs a C++ compiler")
+    return compiled_firmware(folder, timer_ms, coils, sensors=sensors)
 
-    kind: str  # serial or ni
-    address: str
-    file: Path
-    coils: int = 3
+
+@dataclass(frozen=True)
+class Device(OutputSamples):
+    """A twin with coils on it. Currents are those with an amplifier of 1 A/V."""
+
+    kind: str = "serial"  # or ni
+    address: str = ""
 
     @property
     def sets(self) -> tuple[str, ...]:
@@ -34,24 +40,6 @@ class Device:
         if self.kind == "serial":
             return (f'lab.serial.port="{self.address}"',)
         return ("lab.amplifier=ni", f'lab.ni.server="{self.address}"', f'lab.ni.channels="{channels(self.coils)}"')
-
-    @property
-    def a_per_unit(self) -> float:
-        """Current of a coil for one unit of the outputs in the file, with an amplifier of 1 A/V."""
-        return FULL_A if self.kind == "serial" else 1.0
-
-    @property
-    def sample_bytes(self) -> int:
-        """Length of a record of the file."""
-        return sample(self.coils).itemsize
-
-    def end(self) -> int:
-        """The byte of the file from which on the samples to come are."""
-        return self.file.stat().st_size // self.sample_bytes * self.sample_bytes
-
-    def outputs(self, from_byte: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) times on CLOCK_MONOTONIC in ns, and (n, coils) currents in A from each time on."""
-        return read_samples(self.file, self.a_per_unit, from_byte, self.coils)
 
     def energised(self, from_byte: int = 0) -> bool:
         """Whether there was a field since then."""
@@ -84,15 +72,15 @@ def device(kind: str, folder: Path, timer_ms: int = 100, coils: int = 3) -> Iter
         program = compiled(
             Path(_programs().name), timer_ms if kind.endswith("timer") else 0, coils, kind.endswith("sensors")
         )
-        with firmware_twin(program, file, coils, folder / "fault") as twin:
-            yield Device("serial", twin.port, file, coils)
+        with emulated_board(program, file, coils, folder / "fault") as board:
+            yield Device(file, FULL_A, coils, "serial", board.port)
         return
     command = [sys.executable, "-m", "tests.twins.ni", file, str(coils)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, **pipes, text=True, cwd=_ROOT, env=environment()) as server:
         try:
             assert server.stdout is not None
-            yield Device("ni", f"127.0.0.1:{server.stdout.readline().strip()}", file, coils)
+            yield Device(file, 1.0, coils, "ni", f"127.0.0.1:{server.stdout.readline().strip()}")
         finally:
             server.kill()
 

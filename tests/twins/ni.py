@@ -27,7 +27,7 @@ from nidaqmx._stubs import nidaqmx_pb2 as pb
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
 from flowrec.core.system.processes import Priority, prioritise_process
-from tests.twins.firmware import sample
+from flowrec.rigs.emulated.coils import sample
 
 DEVICE, RANGE_V, MAX_RATE_HZ = "cDAQ1Mod1", 10.0, 100_000.0
 _STEP_S = 0.001

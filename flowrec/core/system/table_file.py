@@ -1,4 +1,4 @@
-"""Tables of numbers in text or Excel files: a header, then rows. CSV with commas, semicolons or tabs; .xlsx.
+"""Tables of numbers: a header, then rows. CSV with commas, semicolons or tabs; .xlsx; program_tables.py has .mat, .xdf.
 
 A column `time_s` may also be called `Time [s]` or `TIME (s)`: case, spaces and brackets of a unit do not matter.
 """
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from flowrec.core.errors import UsageError
 from flowrec.core.system.bounded_process import BoundedProcess
+from flowrec.core.system.program_tables import HEAD_BYTES, program_of, program_rows
 from flowrec.core.system.regular_file import refuse_irregular
 
 # Columns of times, and what their numbers are in s.
@@ -179,12 +180,14 @@ def read_table(path: Path) -> Table:
         if path.stat().st_size > _LIMIT_BYTES:
             raise UsageError(f"{path}: has {path.stat().st_size / 1e9:.1f} GB; a table of at most 2 GB is read")
         with path.open("rb") as file:
-            excel = file.read(4) == _ZIP
-        if excel or path.suffix.lower() in _EXCEL:
+            head = file.read(HEAD_BYTES)
+        if program := program_of(head):
+            return _check_rows(path, program_rows(path, program))
+        if head.startswith(_ZIP) or path.suffix.lower() in _EXCEL:
             return _check_rows(path, _excel_rows(path))
         text = _text(path.read_bytes())
     except FileNotFoundError as error:
-        raise UsageError(f"{path}: no such file; a table is CSV or Excel (.xlsx)") from error
+        raise UsageError(f"{path}: no such file; a table is CSV, Excel (.xlsx), .mat or .xdf") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{path}: is no text that can be read; save it as CSV in UTF-8, or as .xlsx") from error
     except OSError as error:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.core import Applied, Currents, Measured, RigError, UsageError
+from flowrec.core import Applied, Currents, Measured, RigError, UsageError, nanoseconds, seconds
 from flowrec.rigs.lab.amplifiers.amplifier import Amplifier, AmplifierInfo
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits, ReadBack
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
@@ -28,6 +28,10 @@ from flowrec.stages import AMPLIFIERS, FieldCommand, FieldLog
 if TYPE_CHECKING:
     from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
+_NOTABLE = 0.05  # relative change of the frequency by which a command can be told from that before it
+_SAME = 0.02  # likewise, within which a field is that of the command
+_STAMP_ERROR_S = 1e-3  # of the log of the outputs
+_AWAITED_S = 1.0  # a command that has not taken effect by then was replaced by another one
 BEAT_S = 0.02  # between beats, at most, while the loop waits for a frame
 _REST = FieldCommand()
 
@@ -49,6 +53,8 @@ class Drive:
     Attributes
     ----------
     info : what the amplifier says of itself, inside of the context.
+    field_ms : from the latest command of another frequency to the field that it asks for, by the log of the outputs;
+        None before there was one.
     """
 
     @classmethod
@@ -79,6 +85,8 @@ class Drive:
         self._commanded_s = self._on_until_s = 0.0
         self._read_back = ReadBack(None, 0.0)
         self._accounted: tuple[int, int, np.ndarray] | None = None  # the last frame's times, and its turns
+        self.field_ms: float | None = None
+        self._awaited: tuple[int, float] | None = None  # time and frequency of a command whose field is to come
 
     def __enter__(self) -> Self:
         """Find the amplifier, check the limits, start the guardian. The output is at zero.
@@ -145,6 +153,7 @@ class Drive:
     def applied_at(self, stamp_ns: int, before_ns: int | None) -> Applied:
         """Field between two frames. Late reports on the time before correct the number of turns."""
         log = self.put_out(stamp_ns)
+        self._look_for_field(log)
         result = log.applied_at(stamp_ns, before_ns)
         late = np.zeros(2)
         if self._accounted is not None and self._accounted[1] == before_ns:
@@ -157,6 +166,19 @@ class Drive:
         """The latest measurement of the currents; None: there is none, or the amplifier does not measure."""
         measured: Measured | None = self._amplifier.measured() if self.info.measures else None  # type: ignore[attr-defined]
         return measured
+
+    def _look_for_field(self, log: FieldLog) -> None:
+        """Find when the awaited command took effect, by its frequency, which differs from that before it."""
+        if self._awaited is None:
+            return
+        sent_ns, frequency_hz = self._awaited
+        first = int(np.searchsorted(log.times_ns, sent_ns - nanoseconds(_STAMP_ERROR_S)))
+        there = np.abs(log.frequency_hz[first:] - frequency_hz) < _SAME * frequency_hz
+        if there.any():
+            self.field_ms = max(1e-6 * float(log.times_ns[first + int(np.argmax(there))] - sent_ns), 0.0)
+            self._awaited = None
+        elif seconds(time.monotonic_ns() - sent_ns) > _AWAITED_S:
+            self._awaited = None
 
     def put_out(self, until_ns: int) -> FieldLog:
         """Log of the field that was put out up to a time of the host's monotonic clock."""
@@ -182,6 +204,10 @@ class Drive:
         assert guardian is not None, "commands are for the inside of the context"
         now_s = self._clock() if now_s is None else now_s
         command = _REST if self._taken_away else command
+        before_hz = self._command.frequency_hz if self._command.amplitude_mt > 0.0 else 0.0
+        changes = abs(command.frequency_hz - before_hz) > _NOTABLE * command.frequency_hz
+        if self._awaited is None and command.amplitude_mt > 0.0 and changes:
+            self._awaited = (time.monotonic_ns(), command.frequency_hz)
         if command.amplitude_mt > 0.0:
             self._on_until_s = float("inf")
         elif self._command.amplitude_mt > 0.0:

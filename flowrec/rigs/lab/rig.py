@@ -20,7 +20,19 @@ from functools import partial
 
 import numpy as np
 
-from flowrec.core import Applied, CameraLosses, Currents, Fit, Frame, Image, Measured, RigError, UsageError, nanoseconds
+from flowrec.core import (
+    Applied,
+    CameraLosses,
+    Currents,
+    Delays,
+    Fit,
+    Frame,
+    Image,
+    Measured,
+    RigError,
+    UsageError,
+    nanoseconds,
+)
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import CAUSES, Captured, Grabber
 from flowrec.rigs.lab.drive import BEAT_S, Drive
@@ -159,7 +171,7 @@ class LabRig:
             applied = self._field_between(session, stamp_ns, before_ns)
             applied = replace(applied, absent_until_ns=absent_until_ns)
             if frame is None:
-                yield Inputs(stamp_ns, None, applied, measured=self._measured(session))
+                yield Inputs(stamp_ns, None, applied, measured=self._measured(session), delays=self._delays())
             else:
                 losses, before = session.losses(frame.losses), losses
                 if losses is not before:  # about once a second
@@ -171,6 +183,7 @@ class LabRig:
                     clock=session.fit(frame.clock),
                     losses=losses,
                     measured=self._measured(session),
+                    delays=self._delays(frame),
                 )
             before_ns = stamp_ns
             frame = self._next(grabber)
@@ -243,7 +256,14 @@ class LabRig:
 
     def _absent_ns(self, session: _Session) -> int:
         """Stamp of a tick without an image: before that of a frame whose exposure has begun."""
-        return session.stamp_ns(time.monotonic_ns() - nanoseconds(self._config.camera.exposure_s + BEAT_S))
+        late_s = self._config.camera.exposure_s + self._config.lab.camera_delay_s + BEAT_S
+        return session.stamp_ns(time.monotonic_ns() - nanoseconds(late_s))
+
+    def _delays(self, frame: Captured | None = None) -> Delays:
+        field_ms = self.drive.field_ms if self.drive is not None else None
+        if frame is None:
+            return Delays(None, None, field_ms)
+        return Delays(1e-6 * (frame.arrival_ns - frame.stamp_ns), frame.arrival_ns, field_ms)
 
     # ---- the coils
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Generator, Iterator
 from copy import copy
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -111,7 +112,7 @@ class SimulatedRig:
         duration_s: float | None = None,
         realtime: bool = False,
         true_field: FlowField | None = None,
-    ) -> SimulatedRig:
+    ) -> Self:
         """The rig of a resolved configuration."""
         return cls(
             pipeline.chip,

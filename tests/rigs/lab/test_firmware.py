@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flowrec.rigs.emulated.coils import OutputSamples
 from flowrec.rigs.lab.amplifiers.serial_protocol import (
     ZERO,
     Reply,
@@ -22,7 +23,7 @@ from flowrec.rigs.lab.amplifiers.serial_protocol import (
 from flowrec.rigs.lab.guardian import SERIAL_ZERO
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
-from tests.twins.firmware import FULL_A, compiled, read_samples
+from tests.twins.coils import compiled
 
 COILS = Coils(
     mt_per_a=((2.1, 0.2, 0.1), (-0.3, 1.9, 0.2), (0.1, 0.2, 1.5)), bias_mt=(0.1, -0.05, 0.04), surface="ceiling"
@@ -69,7 +70,7 @@ class Board:
         assert verbs(self.send("A")) == ["A"]
 
     def currents(self) -> np.ndarray:
-        return read_samples(self.file, FULL_A)[1]
+        return OutputSamples(self.file).outputs()[1]
 
 
 def verbs(replies: list[Reply | None]) -> list[str]:

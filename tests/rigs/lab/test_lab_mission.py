@@ -19,6 +19,7 @@ import pytest
 
 from flowrec.physics.chip.io import load_chip
 from flowrec.physics.flow.sampling import relative_rmse
+from flowrec.rigs.emulated.world import emulated_world
 from flowrec.stages.config import load_config
 from flowrec.stages.pipeline import assemble
 from flowrec.stages.resolve import resolve
@@ -32,7 +33,7 @@ from tests.twins.coils import Device, device
 from tests.twins.emulator import emulated
 from tests.twins.gige import installed
 from tests.twins.lab import COMMON, PATIENT, RATE, recorder, words
-from tests.twins.world import EmulatedView, live_world
+from tests.twins.world import EmulatedView
 
 pytestmark = needs_quiet
 GOAL_UM = (2480.0, 3343.0)
@@ -77,7 +78,7 @@ def test_a_mission_that_surveys_and_refines_arrives_and_replays_exactly(tmp_path
         view = EmulatedView(folder, resolved)
         with (
             device("ni", folder) as coils,
-            live_world(assemble(resolved, chip), resolved, coils, view) as (world, truths),
+            emulated_world(assemble(resolved, chip), resolved, coils, view) as (world, truths),
             recorder(session, *sets, *view.sets, *coils.sets, errors=errors) as process,
         ):
             status = process.wait(240.0)

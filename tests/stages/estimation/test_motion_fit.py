@@ -208,6 +208,22 @@ def test_without_changes_of_the_command_nothing_is_claimed() -> None:
         fit(np.arange(5.0), np.zeros((5, 2)), log)
 
 
+@pytest.mark.parametrize("own_log", [False, True])
+def test_images_that_are_stamped_late_by_other_times_are_placed_where_the_log_is_that_of_the_run(own_log: bool) -> None:
+    """Each shows the robot as it was 40 to 60 ms before its stamp, as of a camera without a clock."""
+    log = commands(5, 25.0)
+    stamps, positions = track(log, 5, 24.0, latency_s=0.0)
+    age_s = 0.04 + np.random.default_rng(5).uniform(0.0, 0.02, len(stamps))
+    seen = np.column_stack([np.interp(stamps - age_s, stamps, positions[:, axis]) for axis in (0, 1)])
+    found = fit_motion(stamps, seen, log.turns, log.span_s, NEAR, exact_log=True, own_log=own_log)
+    assert 0.2 < found.explained < 0.65, "the jitter is what the log does not explain"
+    assert ("explains" in found.refusal) is not own_log
+    assert -found.offset_s == pytest.approx(0.05, abs=3.0 * found.offset_std_s) and found.offset_std_s < 0.01
+    other = commands(6, 25.0)
+    stranger = fit_motion(stamps, seen, other.turns, other.span_s, NEAR, exact_log=True, own_log=own_log)
+    assert stranger.refusal, "a track that does not follow the commands is refused all the same"
+
+
 @pytest.mark.slow("fits many movies")
 def test_stated_errors_hold() -> None:
     """95 of 100 within 1.96 standard errors; and they are not far too large, and larger where less is to be seen."""

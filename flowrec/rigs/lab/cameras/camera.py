@@ -34,6 +34,7 @@ class Wanted:
     offset_px : (x, y) of its upper left pixel; None: the region lies in the middle of the sensor.
     rate_hz : of the frames; with a hardware trigger, of the triggers.
     exposure_s : 0: as the camera has it.
+    delay_s : constant time from the end of an exposure to the arrival of its image.
     gain : in the unit of the camera, dB for most; None: as the camera has it.
     pixel_format : Mono8, Mono10, Mono12, Mono14, Mono16, or a packed one (Mono12p, Mono12Packed).
     trigger : '': the camera runs freely; 'software': a frame per call of `trigger`; else the name of the line, for
@@ -48,6 +49,7 @@ class Wanted:
     offset_px: tuple[int, int] | None = None
     rate_hz: float = 30.0
     exposure_s: float = 0.0
+    delay_s: float = 0.0
     gain: float | None = None
     pixel_format: str = "Mono8"
     trigger: str = ""
@@ -178,6 +180,7 @@ def wanted_of(camera: CameraSettings, lab: Lab) -> Wanted:
         offset_px=None if lab.offset_x_px is None or lab.offset_y_px is None else (lab.offset_x_px, lab.offset_y_px),
         rate_hz=camera.rate_hz,
         exposure_s=camera.exposure_s,
+        delay_s=lab.camera_delay_s,
         gain=lab.gain,
         pixel_format=lab.pixel_format or f"Mono{camera.bits}",
         trigger=lab.trigger,

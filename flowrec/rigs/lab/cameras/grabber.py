@@ -61,8 +61,8 @@ class Captured:
     image, bits : (height, width), uint8 for 8 bits, else uint16 with values below 2**bits.
     index : counts the blocks of the device from the first one on; what is missing was lost.
     stamp_ns : middle of the exposure on the host's monotonic clock: arrival by the fit of the device's clock, less half
-        of the exposure; strictly increasing. The time from the end of the exposure to the earliest arrival (readout and
-        transfer, which is constant) remains in it.
+        of the exposure and the constant delay that is wanted; strictly increasing. What of the time from the end of the
+        exposure to the earliest arrival (readout and transfer) is not wanted remains in it.
     arrival_ns : on the host's monotonic clock.
     clock : the fit, with which the stamp was made; None: the device has no clock, or it stands still.
     losses : by cause; the same message until something more is lost, or a second has passed, so that few are written.
@@ -235,7 +235,7 @@ class Grabber:
         self._info = info
         rate_hz = info.rate_hz or self._wanted.rate_hz
         self._ids.reset(info.id_bits, rate_hz)
-        self._stamper.reset(info, self._wanted.exposure_s)
+        self._stamper.reset(info, self._wanted.exposure_s, self._wanted.delay_s)
         self._attributed = 0
         self._span = (0, 0), (0, 0)
         self._silent_s = max(_SILENT_S, _SILENT_PERIODS / rate_hz) + (info.exposure_s or self._wanted.exposure_s)
@@ -377,27 +377,27 @@ class _Stamper:
         self._stood = 0
         self._last_ns: int | None = None
         self._clock = DeviceClock()
-        self._half_ns = 0
+        self._before_ns = 0  # from the middle of an exposure to the arrival
 
-    def reset(self, info: CameraInfo, exposure_s: float) -> None:
+    def reset(self, info: CameraInfo, exposure_s: float, delay_s: float) -> None:
         """Begin with a connection."""
         if info.ticks_per_s:
             self._clock = DeviceClock(unit=NS_PER_S / info.ticks_per_s)
-        self._half_ns = nanoseconds(0.5 * (info.exposure_s or exposure_s))
+        self._before_ns = nanoseconds(0.5 * (info.exposure_s or exposure_s) + delay_s)
         self._stood = 0
         self.frozen = False
 
     def take(self, ticks: int | None, arrival_ns: int) -> tuple[int, Fit | None, int | None]:
         """The stamp of a frame, the fit that made it, and the stamp before."""
         before_ns, fit = self._last_ns, None
-        stamp_ns = arrival_ns - self._half_ns
+        stamp_ns = arrival_ns - self._before_ns
         if ticks is not None and not self.frozen:
             self._fit = self._clock.take(self._fit, ticks, arrival_ns)
             self._stood = self._stood + 1 if self._fit.flag == "duplicate" else 0
             self.frozen = self._stood == _FROZEN
             if self._fit.good:
                 fit = self._fit
-                stamp_ns = fit.stamp_ns - self._half_ns
+                stamp_ns = fit.stamp_ns - self._before_ns
         if before_ns is not None:
             stamp_ns = max(stamp_ns, before_ns + 1)
         self._last_ns = stamp_ns

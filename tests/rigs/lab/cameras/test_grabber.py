@@ -57,6 +57,15 @@ def test_frames_and_losses_by_cause_add_up_to_the_ids() -> None:
     assert [int(frame.image[0, 0]) for frame in frames] == [n % 251 for n in (65_530, 65_531, 65_533, 65_534, 1, 5, 6)]
 
 
+def test_a_stamp_is_the_middle_of_the_exposure_also_of_a_camera_whose_images_arrive_late() -> None:
+    for delay_s in (0.0, 0.1):
+        camera = Scripted.delivering([block(1), block(2)])
+        with grabbing(camera, wanted=replace(WANTED, exposure_s=0.02, delay_s=delay_s)) as grabber:
+            frames = captured(grabber, camera)
+        before_ns = [frame.arrival_ns - frame.stamp_ns for frame in frames]
+        assert before_ns == [round(1e9 * (0.01 + delay_s))] * 2
+
+
 def test_an_incomplete_image_is_never_handed_on_and_is_counted() -> None:
     camera = Scripted.delivering([block(1, whole=False), block(2), block(3, whole=False), block(4)])
     with grabbing(camera) as grabber:

@@ -1,0 +1,95 @@
+"""`flowrec emulate NAME`: verbs that start devices which this computer does not have."""
+
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flowrec.core import say
+from flowrec.verbs.command import add_verb, verb
+from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions
+
+if TYPE_CHECKING:
+    from flowrec.verbs.emulated_lab import EmulatedLab
+
+_END_S = 10.0  # for a recorder that was interrupted
+
+
+class Flown:
+    """A mission that was flown on emulated devices, or none.
+
+    Attributes
+    ----------
+    exit_status : of the recorder.
+    """
+
+    def __init__(self, session: Path | None = None, exit_status: int = 0, latency: str = "") -> None:
+        self.session, self.exit_status, self._latency = session, exit_status, latency
+
+    def show(self) -> None:
+        """Print the chain of latency."""
+        if self._latency:
+            say(f"latency, median and (95 %): {self._latency}")
+
+
+@verb("flowrec emulate lab", "flowrec emulate lab --fly a.mcap", with_json=False)
+def lab(
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="TOML", help="Configuration of the devices, removed at the end.")
+    ] = Path("emulated_lab.toml"),
+    fly: Annotated[
+        Path | None, typer.Option(metavar="SESSION", help="Record one mission on them, and end them after it.")
+    ] = None,
+    camera_delay_ms: Annotated[
+        float,
+        typer.Option(metavar="MS", min=0.0, max=500.0, help="Time from the end of an exposure to its image."),
+    ] = 12.0,
+    sets: Sets = None,
+    overwrite: Overwrite = False,
+) -> Flown:
+    """Emulate the devices of a lab and a robot in flow between them; flowrec record runs on them as on yours.
+
+    The camera is a stream of images on the loopback. The amplifier is the firmware, compiled, behind a pseudo terminal.
+    Between them a simulated robot is moved by what the amplifier puts out, never by what the recorder commands. A robot
+    is put back to its start when there has been no field for some seconds.
+
+    Raises
+    ------
+    RigError : nothing can compile the firmware; a device does not start.
+    UsageError, OutputError : settings that describe no lab; the file may not be written.
+    """
+    from flowrec.verbs.emulated_lab import emulated_lab
+
+    with emulated_lab(out, 1e-3 * camera_delay_ms, sets or (), overwrite) as made:
+        if fly is not None:
+            return _fly(made, fly, overwrite)
+        say(f"camera at {made.camera}, amplifier at {made.port}; {made.file} has the settings that use them")
+        say(f"in another terminal: flowrec record {made.file}")
+        say("Ctrl-C ends the devices")
+        while True:
+            made.wait()
+
+
+def _fly(made: "EmulatedLab", session: Path, overwrite: bool) -> Flown:
+    """Record a mission in a process of its own, as a person in another terminal would."""
+    from flowrec.core import start_child
+
+    words = ["record", str(made.file), "--out", str(session), *(["--overwrite"] if overwrite else [])]
+    say(f"flowrec {' '.join(words)}")
+    recorder = start_child("flowrec", *words, stdin=None, stdout=None)
+    try:
+        status = recorder.wait()
+    except KeyboardInterrupt:
+        recorder.send_signal(signal.SIGINT)  # in a session of its own, it has not seen Ctrl-C
+        recorder.wait(_END_S)
+        raise
+    if not session.exists():
+        return Flown(None, status)
+    from flowrec.store import Session
+
+    return Flown(session, status, str(Session(session).outcome.get("latency", "")))
+
+
+emulate = typer.Typer(cls=WholeDescriptions, help="Start emulated devices on this computer.", no_args_is_help=True)
+add_verb(emulate, lab)
