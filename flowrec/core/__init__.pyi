@@ -39,7 +39,8 @@ from .messages import (
     Appearance as Appearance, Applied as Applied, AxesCheck as AxesCheck, Background as Background,
     Currents as Currents, Demand as Demand, Estimate as Estimate, Event as Event, FlowField as FlowField,
     Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
-    OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
+    OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, TracerTruth as TracerTruth,
+    Tracers as Tracers, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )
 from .messages.slow_stages import VALUES as VALUES, fluid_of as fluid_of, values_of as values_of

@@ -31,6 +31,8 @@ from flowrec.core.messages import (
     OperatorEvent,
     Route,
     Shift,
+    TracerTruth,
+    Tracers,
     Track,
     Truth,
 )
@@ -42,7 +44,7 @@ _UNCERTAINTY = ("sampler", "flow", "refine.assimilate")  # that of the flow afte
 _SOLVE = SlowStage({WorkOrder.SOLVE: ("flow", "refine.assimilate")}, reads=(), settings=("flow",))
 _REFINE = SlowStage(
     {WorkOrder.REFINE: ("sampler", "flow", "refine")},
-    reads=("assumed", "refined", "observations"),
+    reads=("assumed", "refined", "observations", "tracer_flow"),
     settings=("stabilise", "tracker", "observer", "sampler", "refine", "mission"),
 )
 _PLAN = SlowStage(
@@ -50,7 +52,7 @@ _PLAN = SlowStage(
         WorkOrder.SURVEY_ROUTE: ("robot", "survey", "mission.survey_limit_s", "mission.lead_s", *_UNCERTAINTY),
         WorkOrder.ROUTE: ("robot", "plan", "mission.lead_s", *_UNCERTAINTY),
     },
-    reads=("assumed", "refined", "health", "route", "estimate", "observations", "demand"),
+    reads=("assumed", "refined", "health", "route", "estimate", "observations", "tracer_flow", "demand"),
     settings=("robot", "survey", "plan"),
 )
 
@@ -84,7 +86,7 @@ class Extra(Mapping[str, Message]):
 
 
 NO_EXTRA = Extra()
-_OF_IMAGES = ("applied", "operator", "track", "estimate", "health", "demand", "currents", "timing", "mapless")
+_OF_IMAGES = ("applied", "operator", "track", "estimate", "health", "demand", "currents", "timing", "mapless", "tracers")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +125,9 @@ class Tick:
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
     background: Annotated[Background | None, Topic("/camera/background", Source.STAGE, 1e-6)] = None
     shift: Annotated[Shift | None, Topic("/camera/shift", Source.STAGE, 1e-6)] = None
+    tracers: Annotated[Tracers | None, Topic("/tracers/tracks", Source.STAGE, 1e-6)] = None
+    tracer_flow: Annotated[Observations | None, Topic("/tracers/observations", Source.STAGE, 1e-6)] = None
+    true_tracers: Annotated[TracerTruth | None, Topic("/truth/tracers", Source.SIMULATOR)] = None
     extra: Extra = NO_EXTRA  # of the other topics that the run declares (declared_topics.py)
 
     @property

@@ -10,9 +10,9 @@ Points are (x, y); arrays are [row, column] = [y, x]. Stamps are nanoseconds on 
 
 from flowrec.core.messages.control import AxesCheck, Currents, Demand, Event, Mission
 from flowrec.core.messages.estimation import Estimate, Health, Observations
-from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, OperatorEvent, Truth, pixel_type
+from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, OperatorEvent, TracerTruth, Truth, pixel_type
 from flowrec.core.messages.slow_stages import FlowField, Route
-from flowrec.core.messages.vision import Appearance, Background, Shift, Track, shift_px
+from flowrec.core.messages.vision import Appearance, Background, Shift, Tracers, Track, shift_px
 
 __all__ = [
     "PIXEL_BITS",
@@ -32,6 +32,8 @@ __all__ = [
     "OperatorEvent",
     "Route",
     "Shift",
+    "TracerTruth",
+    "Tracers",
     "Track",
     "Truth",
     "pixel_type",
