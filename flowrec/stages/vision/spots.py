@@ -12,13 +12,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from flowrec.core import Floats, Image
+from flowrec.core import Bools, Floats, Image
 from flowrec.stages.vision.walls import Walls
 
 _WIDER = 1.6  # of the two blurs
 _LEAST_SIGMA_PX = 0.8  # a narrower one follows single pixels
 _EVERY = 4  # pixel along rows and columns is enough for the median
 _MAD = 0.6745  # of a normal distribution, in standard deviations
+# What is fainter than this part of a body, and so near to it, is its diffraction ring and no other body.
+_RING_SHARE, _RING_RADII, _RING_PX = 0.4, 2.0, 5.0
 _LEAST_NOISE = 0.02  # grey levels, of an image without noise
 
 
@@ -63,7 +65,22 @@ class SpotSearch:
         here = contrast[rows, columns]
         x = columns + _vertex(contrast[rows, columns - 1], here, contrast[rows, columns + 1]) + left
         y = rows + _vertex(contrast[rows - 1, columns], here, contrast[rows + 1, columns]) + top
-        return np.column_stack((x, y)).astype(np.float64), here.astype(np.float64) / noise
+        px, snr = np.column_stack((x, y)).astype(np.float64), here.astype(np.float64) / noise
+        ring = _on_ring(px, snr, _RING_RADII * self.radius_px + _RING_PX)
+        return px[~ring], snr[~ring]
+
+
+def _on_ring(px: Floats, snr: Floats, within_px: float) -> Bools:
+    """(n,) which spots are so much fainter than one nearby that they are its diffraction ring."""
+    from scipy.spatial import cKDTree  # not at start-up
+
+    ring = np.zeros(len(px), np.bool_)
+    if len(px) < 2:
+        return ring
+    pairs = cKDTree(px).query_pairs(within_px, output_type="ndarray")
+    for one, other in (pairs.T, pairs.T[::-1]):
+        ring[one[snr[one] < _RING_SHARE * snr[other]]] = True
+    return ring
 
 
 def _half_size(sigma_px: float) -> int:

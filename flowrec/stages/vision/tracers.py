@@ -26,7 +26,7 @@ _STD_PX = 0.15  # of a spot's place, per component
 _SPEED_SHARE = 0.5  # of the robot's top speed: standard deviation of the velocity of a new body, per component
 _ACCELERATION_PER_S = 2.0  # of that top speed: white acceleration over a second
 _GATE = 16.0  # largest d^2 / S: four standard deviations
-_NEAR_ROBOT_RADII = 1.6  # a spot that is nearer to the robot is a part of its image
+_NEAR_ROBOT_RADII = 2.4  # a spot that is nearer to the robot is a part of its image, or of a ring around it
 _EDGE_RADII = 6.0  # from an opening or the edge of the image, and as far as the flow goes in a frame: it came in there
 _LEAST_AGE = 3  # images, from which on the stretches of a way count
 
