@@ -21,7 +21,7 @@ from flowrec.physics import Chip, sample
 EVEN = (1.0, float(np.sqrt(0.2)))  # mean and standard deviation of c of tracers in view at first
 ENTERED = (1.2, float(np.sqrt(54.0 / 35.0 - 1.44)))  # of those that came in later
 MOST_EACH = 6  # observations of one tracer: more tell no more of the flow than its height permits
-MOST = 400  # of all tracers: the time of a refinement grows with the square
+MOST = 100  # of all tracers, the latest first: the time of a refinement grows with the square
 
 
 def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -> Observations:
@@ -43,14 +43,12 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
 def _chosen(tracer: Floats) -> np.ndarray:
     """(k,) indices of the observations of the robot, then of the latest tracers, evenly along the way of each."""
     chosen = [np.flatnonzero(tracer < 0.0)]
-    count = 0
-    for number in np.unique(tracer[tracer >= 0.0])[::-1]:
+    numbers = np.unique(tracer[tracer >= 0.0])[-MOST:]
+    each = min(max(MOST // max(len(numbers), 1), 1), MOST_EACH)
+    for number in numbers:
         own = np.flatnonzero(tracer == number)
-        own = own[np.unique(np.linspace(0, len(own) - 1, min(len(own), MOST_EACH)).round().astype(np.intp))]
-        if count + len(own) > MOST:
-            break
-        count += len(own)
-        chosen.append(own)
+        inner = (np.arange(min(each, len(own))) + 0.5) / min(each, len(own))
+        chosen.append(own[(inner * len(own)).astype(np.intp)])
     return np.concatenate(chosen)
 
 
