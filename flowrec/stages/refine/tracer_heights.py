@@ -15,12 +15,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import Floats, FlowField, Observations
-from flowrec.physics import Chip, sample
+from flowrec.core import Floats, FlowField, Ints, Observations, cells_at
+from flowrec.physics import Chip, clearance_um, sample
 
 EVEN = (1.0, float(np.sqrt(0.2)))  # mean and standard deviation of c of tracers in view at first
 ENTERED = (1.2, float(np.sqrt(54.0 / 35.0 - 1.44)))  # of those that came in later
 MOST_EACH = 6  # observations of one tracer: more tell no more of the flow than its height permits
+# Of the speed of a tracer, one standard deviation by which c differs along its way: it settles, and lags near side walls.
+VARIES_SHARE = 0.1
+# Pixels of the mask from a wall: nearer to it than walls may be off, a predicted speed says nothing of a tracer's.
+LEAST_PX = 2.0
 MOST = 100  # of all tracers, the latest first: the time of a refinement grows with the square
 
 
@@ -28,6 +32,10 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
     """The observations with those of tracers divided by the mean of c; themselves without tracers."""
     if observations.tracer is None or observations.entered is None:
         return observations
+    clear_px = clearance_um(chip.mask, 1.0)
+    away_px = cells_at(observations.position_um / chip.um_per_px, chip.mask.shape).interpolate(clear_px)
+    observations = observations.only((observations.tracer < 0.0) | (away_px > LEAST_PX))
+    assert observations.tracer is not None
     observations = observations.only(_chosen(observations.tracer))
     tracer, entered = observations.tracer, observations.entered
     assert tracer is not None and entered is not None
@@ -37,10 +45,12 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
     flat = 1.0 if chip.depth_um is not None else _profile_share(observations.only(beads), assumed)
     mean = 1.0 + flat * (np.where(entered > 0.0, ENTERED[0], EVEN[0]) - 1.0)
     mean = np.where(beads, mean, 1.0)
-    return replace(observations, flow_um_s=observations.flow_um_s / mean[:, None], std_um_s=observations.std_um_s / mean)
+    flow_um_s = observations.flow_um_s / mean[:, None]
+    varied = np.where(beads, VARIES_SHARE * np.hypot(*flow_um_s.T), 0.0)
+    return replace(observations, flow_um_s=flow_um_s, std_um_s=np.hypot(observations.std_um_s / mean, varied))
 
 
-def _chosen(tracer: Floats) -> np.ndarray:
+def _chosen(tracer: Floats) -> Ints:
     """(k,) indices of the observations of the robot, then of the latest tracers, evenly along the way of each."""
     chosen = [np.flatnonzero(tracer < 0.0)]
     numbers = np.unique(tracer[tracer >= 0.0])[-MOST:]
