@@ -31,8 +31,8 @@ from flowrec.core.messages import (
     OperatorEvent,
     Route,
     Shift,
-    TracerTruth,
     Tracers,
+    TracerTruth,
     Track,
     Truth,
 )
@@ -86,7 +86,18 @@ class Extra(Mapping[str, Message]):
 
 
 NO_EXTRA = Extra()
-_OF_IMAGES = ("applied", "operator", "track", "estimate", "health", "demand", "currents", "timing", "mapless", "tracers")
+_OF_IMAGES = (
+    "applied",
+    "operator",
+    "track",
+    "estimate",
+    "health",
+    "demand",
+    "currents",
+    "timing",
+    "mapless",
+    "tracers",
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -277,7 +277,9 @@ def with_inputs(last: Tick, inputs: Inputs, topics: TopicTable = FIXED) -> Tick:
     new: dict[str, Any] = {name: message for name in HELD if (message := getattr(inputs, name)) is not None}
     if inputs.extra:
         new["extra"] = last.extra.with_messages(_of_source(inputs.extra, topics, Source.RIG))
-    return replace(last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, true_tracers=None, **new)
+    return replace(
+        last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, true_tracers=None, **new
+    )
 
 
 def recorded_extra(tick: Tick, inputs: Inputs, topics: TopicTable) -> Extra:

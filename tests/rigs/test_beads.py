@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import numpy as np
 import pytest
 
@@ -33,7 +32,9 @@ def test_beads_go_with_a_part_of_the_flow_that_their_height_decides() -> None:
     floats = every.truth(0).stuck == 0.0
     share = every.speed_share()
     assert 0.0 < share[floats].min() < 0.2 and share.max() <= 1.5 and (share[~floats] == 0.0).all()
-    assert share[floats].mean() == pytest.approx(1.0, abs=0.05), "those that are spread evenly have the mean of the flow"
+    assert share[floats].mean() == pytest.approx(1.0, abs=0.05), (
+        "those that are spread evenly have the mean of the flow"
+    )
     assert (~floats).mean() == pytest.approx(0.05, abs=0.02)
     flat = beads(None)
     assert set(flat.speed_share()) <= {0.0, 1.0}
@@ -60,4 +61,3 @@ def test_a_bead_that_leaves_comes_in_as_another_one_where_the_flux_is() -> None:
     truth = every.truth(0)
     new = truth.id > before.max()
     assert new.any() and len(set(truth.id)) == 300
-    

@@ -136,7 +136,7 @@ class Beads:
 
 
 def profile_exponent(depth_over_width: float) -> float:
-    """n of the profile over the depth."""
+    """N of the profile over the depth."""
     if depth_over_width <= 1.0:
         return 2.0 + 0.3 * max(depth_over_width - 1.0 / 3.0, 0.0)
     return 1.7 + 0.5 * depth_over_width**1.4

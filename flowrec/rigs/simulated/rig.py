@@ -34,7 +34,16 @@ from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.beads import Beads
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.rigs.simulated.world import Shake, TrueCoils, World, misregister, true_depth_um, true_pump, true_robot, world_of
+from flowrec.rigs.simulated.world import (
+    Shake,
+    TrueCoils,
+    World,
+    misregister,
+    true_depth_um,
+    true_pump,
+    true_robot,
+    world_of,
+)
 from flowrec.stages import (
     Coils,
     FieldCommand,

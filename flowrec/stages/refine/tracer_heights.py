@@ -21,7 +21,7 @@ from flowrec.physics import Chip, clearance_um, sample
 EVEN = (1.0, float(np.sqrt(0.2)))  # mean and standard deviation of c of tracers in view at first
 ENTERED = (1.2, float(np.sqrt(54.0 / 35.0 - 1.44)))  # of those that came in later
 MOST_EACH = 6  # observations of one tracer: more tell no more of the flow than its height permits
-# Of the speed of a tracer, one standard deviation by which c differs along its way: it settles, and lags near side walls.
+# Of a tracer's speed, one standard deviation by which c differs along its way: it settles, and lags near side walls.
 VARIES_SHARE = 0.1
 # Pixels of the mask from a wall: nearer to it than walls may be off, a predicted speed says nothing of a tracer's.
 LEAST_PX = 2.0
@@ -70,7 +70,7 @@ def _profile_share(beads: Observations, assumed: FlowField) -> float:
     """
     predicted = sample(assumed, beads.position_um)
     assert beads.tracer is not None and beads.entered is not None
-    number, index = np.unique(beads.tracer, return_inverse=True)
+    index = np.unique(beads.tracer, return_inverse=True)[1]
     along = np.bincount(index, (predicted * beads.flow_um_s).sum(axis=1))
     power = np.bincount(index, (predicted**2).sum(axis=1))
     flows = power > 1e-6 * max(float(power.max()), 1e-12)

@@ -16,7 +16,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, Frame, Range, Track, Tracers, seconds
+from flowrec.core import Floats, Frame, Range, Tracers, Track, seconds
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.spots import SpotSearch
 from flowrec.stages.vision.walls import Walls, walls_in_view

@@ -60,12 +60,14 @@ def test_bodies_keep_their_numbers_through_crossings_and_are_placed_within_their
         off = (end.velocity_um_s[row] - velocity[n] * UM * RATE_HZ) / end.velocity_std_um_s[row]
         assert np.abs(off).max() < 4.0
     for k, each in enumerate(found[5:10], 5):
-        places = {name: place for name, place in zip(each.id, each.position_um, strict=True)}
+        places = dict(zip(each.id, each.position_um, strict=True))
         assert max(np.abs(places[name] / UM - ways[k][n]).max() for n, name in names.items()) < 0.3
 
 
 def test_a_body_that_comes_in_at_the_edge_has_entered_and_one_that_was_there_has_not() -> None:
-    ways = straight(np.array([[80.0, 60.0], [-20.0, 50.0], [100.0, 80.0]]), np.array([[0.5, 0.0], [3.0, 0.0], [0, 0]]), 24)
+    ways = straight(
+        np.array([[80.0, 60.0], [-20.0, 50.0], [100.0, 80.0]]), np.array([[0.5, 0.0], [3.0, 0.0], [0, 0]]), 24
+    )
     ways[:12, 2] = np.nan  # appears in the middle
     end = followed(ways)[-1]
     entered = {tuple(np.rint(p / UM / 10).astype(int)): e for p, e in zip(end.position_um, end.entered, strict=True)}
