@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.core import Floats, FlowField, TracerTruth
 from flowrec.physics import Chip, median_width_um, walls_of
@@ -48,7 +49,7 @@ class Beads:
         robot_radius_um: float,
         depth_um: float | None,
         field: FlowField,
-        clearance_um: Floats,
+        clearance_um: NDArray[np.float32],
         pump: Pump,
     ) -> None:
         count = simulated.tracers

@@ -36,7 +36,7 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
     away_px = cells_at(observations.position_um / chip.um_per_px, chip.mask.shape).interpolate(clear_px)
     observations = observations.only((observations.tracer < 0.0) | (away_px > LEAST_PX))
     assert observations.tracer is not None
-    observations = observations.only(_chosen(observations.tracer))
+    observations = observations.only(_few_of_each(observations.tracer))
     tracer, entered = observations.tracer, observations.entered
     assert tracer is not None and entered is not None
     beads = tracer >= 0.0
@@ -50,7 +50,7 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
     return replace(observations, flow_um_s=flow_um_s, std_um_s=np.hypot(observations.std_um_s / mean, varied))
 
 
-def _chosen(tracer: Floats) -> Ints:
+def _few_of_each(tracer: Floats) -> Ints:
     """(k,) indices of the observations of the robot, then of the latest tracers, evenly along the way of each."""
     chosen = [np.flatnonzero(tracer < 0.0)]
     numbers = np.unique(tracer[tracer >= 0.0])[-MOST:]

@@ -26,7 +26,7 @@ _LEAST_NOISE = 0.02  # grey levels, of an image without noise
 
 @dataclass(frozen=True, slots=True)
 class SpotSearch:
-    """What a body looks like."""
+    """The look of a body, and the search for it."""
 
     radius_px: float
     dark: bool  # relative to the background
@@ -39,7 +39,7 @@ class SpotSearch:
 
     @property
     def pad_px(self) -> int:
-        """How far around a place its pixels are read."""
+        """Pixels that are read around a place, to each side."""
         return _half_size(_WIDER * self.sigma_px) + 2
 
     def find(self, image: Image, walls: Walls) -> tuple[Floats, Floats]:
@@ -71,7 +71,7 @@ class SpotSearch:
 
 
 def _on_ring(px: Floats, snr: Floats, within_px: float) -> Bools:
-    """(n,) which spots are so much fainter than one nearby that they are its diffraction ring."""
+    """(n,) True for spots that are so much fainter than one nearby that they are its diffraction ring."""
     from scipy.spatial import cKDTree  # not at start-up
 
     ring = np.zeros(len(px), np.bool_)

@@ -64,7 +64,7 @@ class TracerTracker:
     stretch_s: Annotated[float, Range(0.1, 1e3)] = 4.0  # the longest time of such a stretch
 
     def search(self, um_per_px: float, robot: Robot) -> SpotSearch:
-        """How spots are searched for in an image of this scale."""
+        """The search for spots in an image of this scale."""
         radius_um = _RADIUS_SHARE * robot.radius_um if self.radius_um is None else self.radius_um
         return SpotSearch(radius_um / um_per_px, self.look == "dark", self.least_snr)
 
@@ -92,22 +92,22 @@ class TracerTracker:
         spots_um = calibration.to_um(px).reshape(-1, 2)
         now_s, next_id = seconds(frame.stamp_ns), 0
         std_um, dt = _STD_PX * calibration.um_per_px, 0.0
-        bodies = _born(np.zeros((0, 2)), 0, np.zeros(0), std_um, robot, now_s)
+        bodies = _new_bodies(np.zeros((0, 2)), 0, np.zeros(0), std_um, robot, now_s)
         if previous is not None:
             next_id = previous.next_id
             dt = seconds(frame.stamp_ns - previous.stamp_ns)
-            bodies = _expected(previous, dt, robot)
+            bodies = _predict(previous, dt, robot)
         rows, columns = assign(bodies.position_um, bodies.std_um**2 + std_um**2, spots_um)
-        bodies = self._next_stretch(_corrected(bodies, rows, spots_um[columns], std_um), robot, now_s)
+        bodies = self._next_stretch(_correct(bodies, rows, spots_um[columns], std_um), robot, now_s)
         kept = bodies.lost_frames * dt <= self.keep_s
         kept &= _in_view(bodies.position_um, walls, calibration)
         free = np.ones(len(spots_um), np.bool_)
         free[columns] = False
         margin_um = _EDGE_RADII * self.search(1.0, robot).radius_px + robot.max_speed_um_s * dt
         entered = _near_edge(spots_um[free], margin_um, chip, calibration, frame.image.shape) & (previous is not None)
-        born = _born(spots_um[free], next_id, entered.astype(np.float64), std_um, robot, now_s)
-        joined = (np.concatenate(pair) for pair in zip(bodies.only(kept), born, strict=True))
-        return Tracers(frame.stamp_ns, *joined, next_id + len(born.id))
+        born = _new_bodies(spots_um[free], next_id, entered.astype(np.float64), std_um, robot, now_s)
+        joined = _Bodies(*(np.concatenate(pair) for pair in zip(bodies.only(kept), born, strict=True)))
+        return Tracers(frame.stamp_ns, **joined._asdict(), next_id=next_id + len(born.id))
 
     def _next_stretch(self, bodies: _Bodies, robot: Robot, now_s: float) -> _Bodies:
         """Begin the next stretch of the way of each body that has ended one."""
@@ -122,7 +122,7 @@ class TracerTracker:
 
 
 def assign(expected: Floats, variance: Floats, spots: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Which spot is which body: indices (k,) of bodies expected at (n, 2), and of their spots (m, 2).
+    """The assignment of spots to bodies: indices (k,) of bodies expected at (n, 2), and of their spots (m, 2).
 
     `variance` (n,) is that of the distance per component.
     """
@@ -163,7 +163,7 @@ def assign(expected: Floats, variance: Floats, spots: Floats) -> tuple[NDArray[n
     return both[0], both[1]
 
 
-def _expected(previous: Tracers, dt: float, robot: Robot) -> _Bodies:
+def _predict(previous: Tracers, dt: float, robot: Robot) -> _Bodies:
     """The bodies a time later, not seen."""
     p = previous
     jerk = (_ACCELERATION_PER_S * robot.max_speed_um_s) ** 2  # um2/s4 over a second: per s
@@ -185,7 +185,7 @@ def _expected(previous: Tracers, dt: float, robot: Robot) -> _Bodies:
     )
 
 
-def _corrected(bodies: _Bodies, rows: NDArray[np.intp], spots_um: Floats, std_um: float) -> _Bodies:
+def _correct(bodies: _Bodies, rows: NDArray[np.intp], spots_um: Floats, std_um: float) -> _Bodies:
     """The bodies after those of `rows` were seen at spots (k, 2)."""
     position, velocity, shared = bodies.std_um**2, bodies.velocity_std_um_s**2, bodies.shared_um2_s.copy()
     place, speed = bodies.position_um.copy(), bodies.velocity_um_s.copy()
@@ -211,7 +211,7 @@ def _corrected(bodies: _Bodies, rows: NDArray[np.intp], spots_um: Floats, std_um
     )
 
 
-def _born(spots_um: Floats, first: int, entered: Floats, std_um: float, robot: Robot, now_s: float) -> _Bodies:
+def _new_bodies(spots_um: Floats, first: int, entered: Floats, std_um: float, robot: Robot, now_s: float) -> _Bodies:
     """New bodies at spots (n, 2)."""
     count = len(spots_um)
     zeros = np.zeros(count)
