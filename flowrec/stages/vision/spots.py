@@ -34,7 +34,7 @@ class SpotSearch:
 
     @property
     def sigma_px(self) -> float:
-        """Of the narrower blur."""
+        """Standard deviation of the narrower blur."""
         return max(self.radius_px / np.sqrt(2.0), _LEAST_SIGMA_PX)
 
     @property
@@ -51,7 +51,7 @@ class SpotSearch:
         if min(part.shape, default=0) < 3:
             return np.zeros((0, 2)), np.zeros(0)
         light = part.astype(np.float32)
-        narrow, wide = _blurred(light, self.sigma_px), _blurred(light, _WIDER * self.sigma_px)
+        narrow, wide = _blur(light, self.sigma_px), _blur(light, _WIDER * self.sigma_px)
         contrast = wide - narrow if self.dark else narrow - wide
         distance = walls.distance_px[top : top + part.shape[0], left : left + part.shape[1]]
         fluid = distance[::_EVERY, ::_EVERY] > self.radius_px
@@ -87,7 +87,7 @@ def _half_size(sigma_px: float) -> int:
     return int(np.ceil(3.0 * sigma_px))
 
 
-def _blurred(light: np.ndarray, sigma_px: float) -> np.ndarray:
+def _blur(light: np.ndarray, sigma_px: float) -> np.ndarray:
     size = 2 * _half_size(sigma_px) + 1
     return np.asarray(cv2.GaussianBlur(light, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE))
 
