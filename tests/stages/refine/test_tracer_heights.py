@@ -9,7 +9,10 @@ import pytest
 
 from flowrec.core import Observations
 from flowrec.physics import ChipSettings, FlowSolver, load_chip, sample
-from flowrec.stages.refine import Refiner
+from flowrec.stages.refine import Assimilate, Refiner
+from flowrec.stages.refine.causes import Observed
+from flowrec.stages.refine.flow_model import flow_model
+from flowrec.stages.refine.observation_operator import observation_operator
 from flowrec.stages.refine.tracer_heights import ENTERED, EVEN, LEAST_PX, MOST, MOST_EACH, at_mean_height
 
 SOLVER = FlowSolver()
@@ -89,6 +92,15 @@ def test_beads_tell_the_flow_of_a_duct_within_bars_that_their_heights_leave() ->
     assert 0.5 * EVEN[1] / np.sqrt(30) < np.mean(bars) < 2.5 * EVEN[1] / np.sqrt(30)
 
 
-def test_more_observations_of_the_same_bead_tell_no_more_of_its_height() -> None:
-    once, often = (refined(of_beads(6, 3, each=each, factor=1.2))[1] for each in (2, 6))
-    assert often > 0.7 * once, "one bead has one height for its whole life"
+def test_all_observations_of_a_bead_share_the_error_of_its_height_and_the_robot_has_none() -> None:
+    beads = of_beads(2, 1, each=2)
+    operator = observation_operator(
+        replace(beads, tracer=np.array([-1.0, -1.0, 5.0, 5.0])), DUCT.mask, DUCT.um_per_px, ASSUMED.wall_px
+    )
+    settings = Assimilate()
+    model = flow_model(settings, settings.model, DUCT, SOLVER)
+    effects = {each.name: each for each in Observed.of(model, operator).effects(model.base, None)}
+    kernel = effects["height"].kernel[::2, ::2]  # along x, in which the duct lies
+    assert not kernel[:2].any() and not kernel[:, :2].any()
+    assert kernel[2, 3] == pytest.approx(np.sqrt(kernel[2, 2] * kernel[3, 3])) and kernel[2, 3] > 0.0
+    assert not effects["carry"].columns[:, 4:].any(), "a bead is no sphere of the robot's size"
