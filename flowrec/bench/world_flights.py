@@ -270,7 +270,8 @@ def _refine_order(order: Tick, pipeline: Pipeline, config: ResolvedConfig, chip:
         assert order.assumed is not None and order.observations is not None
         return NullModel(method).refine(order.assumed, order.observations, chip, pipeline.solver)
     if method in OF_A_PART:
-        order, method = replace(order, **{OF_A_PART[method]: None}), _IN_FLIGHT
+        left_out: dict[str, Any] = {OF_A_PART[method]: None}
+        order, method = replace(order, **left_out), _IN_FLIGHT
     refiner = replace(config.refine, method=method, adopt="always")
     result = work(replace(pipeline, refiner=refiner), order)
     assert isinstance(result, FlowField)

@@ -330,8 +330,8 @@ class TickLogger:
         drawn = tracers.age_frames >= _LEAST_AGE
         origins = self._scene.to_plane(place_on_chip(self._tick, tracers.position_um[drawn]))
         ways = self._scene.directions(self._scene.length_px(1.0) * _TRACER_S * tracers.velocity_um_s[drawn])
-        style = {"colors": colours.YELLOW, "radii": points(1.0), "draw_order": 27.0}
-        self._log(e.TRACERS, rr.Arrows2D(origins=origins, vectors=ways, **style))
+        drawing = rr.Arrows2D(origins=origins, vectors=ways, colors=colours.YELLOW, radii=points(1.0), draw_order=27.0)
+        self._log(e.TRACERS, drawing)
 
     def _place_of_word(self, centre: Floats) -> Floats:
         """Position of a word about the robot at which neither the view's border nor the second session's robot cuts it.
