@@ -27,7 +27,9 @@ from flowrec.stages import Pipeline, ResolvedConfig, assemble, calibration_of, l
 from flowrec.verbs import refuse_adrift
 
 # Messages of a work order that are kept; the assumed flow is solved again.
-_KEPT = ("mission", "estimate", "health", "observations")
+_KEPT = ("mission", "estimate", "health", "observations", "tracer_flow")
+# Methods that are `assimilate` with a part of what was observed, where tracers were followed.
+OF_A_PART = {"robot_alone": "tracer_flow", "tracers_alone": "observations"}  # and what is left out
 _IN_FLIGHT = "assimilate"  # with which the robot navigates, whatever is compared
 
 
@@ -267,6 +269,9 @@ def _refine_order(order: Tick, pipeline: Pipeline, config: ResolvedConfig, chip:
     if method in NULL_MODELS:
         assert order.assumed is not None and order.observations is not None
         return NullModel(method).refine(order.assumed, order.observations, chip, pipeline.solver)
+    if method in OF_A_PART:
+        left_out: dict[str, Any] = {OF_A_PART[method]: None}
+        order, method = replace(order, **left_out), _IN_FLIGHT
     refiner = replace(config.refine, method=method, adopt="always")
     result = work(replace(pipeline, refiner=refiner), order)
     assert isinstance(result, FlowField)

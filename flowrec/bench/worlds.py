@@ -33,13 +33,13 @@ from flowrec.bench.harness import (
 )
 from flowrec.bench.null_models import NULL_MODELS
 from flowrec.bench.second_worlds import SECOND_WORLDS
-from flowrec.bench.world_flights import WORLDS, Flight, FlightCase, as_line, fly, refine
+from flowrec.bench.world_flights import OF_A_PART, WORLDS, Flight, FlightCase, as_line, fly, refine
 from flowrec.core import UsageError, append_line, pool, progress, say
 from flowrec.stages import REFINERS
 from flowrec.verbs import SetTexts
 
 CHIPS = "bifurcation,vessels-1,vessels-2,vessels-3"
-KNOWN = (*REFINERS, *NULL_MODELS)
+KNOWN = (*REFINERS, *NULL_MODELS, *OF_A_PART)
 METHODS = [name for name in ("fvm", "gain", *NULL_MODELS, "assimilate", "pi_unet") if name in KNOWN]
 NULL = "gain"  # one factor for the whole assumed flow
 _BEYOND = 2.0  # root mean square bars that an error exceeds where the flow was observed

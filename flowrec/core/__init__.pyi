@@ -41,7 +41,8 @@ from .messages import (
     Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
     BY_STREAM as BY_STREAM, EXPECTED as EXPECTED, HEARD as HEARD, SAMPLES as SAMPLES, SILENT as SILENT, STREAMS as STREAMS,
     PUMP as PUMP, PumpShare as PumpShare, Samples as Samples, StreamStates as StreamStates,
-    OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, Track as Track,
+    OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, TracerTruth as TracerTruth,
+    Tracers as Tracers, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )
 from .messages.slow_stages import VALUES as VALUES, fluid_of as fluid_of, values_of as values_of

@@ -32,6 +32,8 @@ from flowrec.core.messages import (
     OperatorEvent,
     Route,
     Shift,
+    Tracers,
+    TracerTruth,
     Track,
     Truth,
 )
@@ -43,7 +45,7 @@ _UNCERTAINTY = ("sampler", "flow", "refine.assimilate")  # that of the flow afte
 _SOLVE = SlowStage({WorkOrder.SOLVE: ("flow", "refine.assimilate")}, reads=(), settings=("flow",))
 _REFINE = SlowStage(
     {WorkOrder.REFINE: ("sampler", "flow", "refine")},
-    reads=("assumed", "refined", "observations"),
+    reads=("assumed", "refined", "observations", "tracer_flow"),
     settings=("stabilise", "tracker", "observer", "sampler", "refine", "mission"),
 )
 _PLAN = SlowStage(
@@ -51,7 +53,7 @@ _PLAN = SlowStage(
         WorkOrder.SURVEY_ROUTE: ("robot", "survey", "mission.survey_limit_s", "mission.lead_s", *_UNCERTAINTY),
         WorkOrder.ROUTE: ("robot", "plan", "mission.lead_s", *_UNCERTAINTY),
     },
-    reads=("assumed", "refined", "health", "route", "estimate", "observations", "demand"),
+    reads=("assumed", "refined", "health", "route", "estimate", "observations", "tracer_flow", "demand"),
     settings=("robot", "survey", "plan"),
 )
 
@@ -85,7 +87,18 @@ class Extra(Mapping[str, Message]):
 
 
 NO_EXTRA = Extra()
-_OF_IMAGES = ("applied", "operator", "track", "estimate", "health", "demand", "currents", "timing", "mapless")
+_OF_IMAGES = (
+    "applied",
+    "operator",
+    "track",
+    "estimate",
+    "health",
+    "demand",
+    "currents",
+    "timing",
+    "mapless",
+    "tracers",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +138,9 @@ class Tick:
     background: Annotated[Background | None, Topic("/camera/background", Source.STAGE, 1e-6)] = None
     shift: Annotated[Shift | None, Topic("/camera/shift", Source.STAGE, 1e-6)] = None
     measured: Annotated[Measured | None, Topic("/coils/measured", Source.RIG)] = None
+    tracers: Annotated[Tracers | None, Topic("/tracers/tracks", Source.STAGE, 1e-6)] = None
+    tracer_flow: Annotated[Observations | None, Topic("/tracers/observations", Source.STAGE, 1e-6)] = None
+    true_tracers: Annotated[TracerTruth | None, Topic("/truth/tracers", Source.SIMULATOR)] = None
     extra: Extra = NO_EXTRA  # of the other topics that the run declares (declared_topics.py)
 
     @property

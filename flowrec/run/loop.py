@@ -201,6 +201,7 @@ def run(
                 timing=timing,
                 truth=inputs.truth,
                 true_field=inputs.true_field,
+                true_tracers=inputs.true_tracers,
                 losses=inputs.losses,
                 extra=recorded_extra(tick, inputs, pipeline.topics),
             )

@@ -20,10 +20,12 @@ def no_observations(stamp_ns: int) -> Observations:
 
 
 def observations_of(pipeline: Pipeline, order: Tick) -> Observations:
-    """The observations that a refinement is given."""
+    """The observations that a refinement is given: of the robot, and of tracers where they are followed."""
     if pipeline.hindsight is not None:
-        return pipeline.hindsight(order.stamp_ns)
-    return pipeline.sampler.treat(order.observations or no_observations(order.stamp_ns))
+        own = pipeline.hindsight(order.stamp_ns)
+    else:
+        own = pipeline.sampler.treat(order.observations or no_observations(order.stamp_ns))
+    return own.with_tracers(order.tracer_flow)
 
 
 def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:

@@ -44,6 +44,8 @@ from flowrec.core import (
     Source,
     Tick,
     TopicTable,
+    Tracers,
+    TracerTruth,
     Track,
     Truth,
     UsageError,
@@ -59,6 +61,7 @@ from flowrec.stages.control.events import event_of
 from flowrec.stages.control.mission import MissionStateMachine
 from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
 from flowrec.stages.estimation.pump import PumpFollower, at_pump
+from flowrec.stages.estimation.tracer_stretches import collect_stretches
 from flowrec.stages.extra_topics import ExtraStage, extra_rows, topics_of
 from flowrec.stages.planning import Planner, SurveyPlanner
 from flowrec.stages.refine import Refiner
@@ -80,10 +83,12 @@ class Inputs:
     route: Route | None = None
     truth: Truth | None = None  # for the record only, no stage reads it
     true_field: FlowField | None = None  # likewise
+    true_tracers: TracerTruth | None = None  # likewise
     track: Track | None = None  # the recorded one, if `frame` was dropped
     appearance: Appearance | None = None  # likewise, if it changed then
     background: Background | None = None  # likewise
     shift: Shift | None = None  # likewise
+    tracers: Tracers | None = None  # likewise
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
     losses: CameraLosses | None = None  # of the camera so far, for the record only
     measured: Measured | None = None  # currents of the coils, by an amplifier that measures them; for the record only
@@ -95,7 +100,7 @@ class Inputs:
 ARRIVING = tuple(topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.TRUTH))
 HELD = tuple(name for name in ARRIVING if BY_FIELD[name].source in (Source.RIG, Source.OPERATOR, Source.WORKER))
 # The results of the stages that read the image: where it was not recorded, a replay takes these.
-FROM_IMAGE = ("track", "appearance", "background", "shift")
+FROM_IMAGE = ("track", "appearance", "background", "shift", "tracers")
 if {each.name for each in fields(Inputs)} != {"stamp_ns", *FROM_IMAGE, "clock", "losses", "delays", "extra", *ARRIVING}:
     raise TypeError(f"pipeline.Inputs needs a field for each input of Tick: {', '.join(ARRIVING)}")
 
@@ -200,12 +205,13 @@ def _strength(coils: Coils, last: Tick) -> float:
 
 
 class Sight(NamedTuple):
-    """Results of an image: the robot, how it looks, and how far the image lies off."""
+    """Results of an image: the robot, how it looks, how far the image lies off, and the tracers."""
 
     track: Track | None = None
     appearance: Appearance | None = None
     background: Background | None = None
     shift: Shift | None = None
+    tracers: Tracers | None = None
 
 
 def look(p: Pipeline, last: Sight, frame: Frame) -> Sight:
@@ -217,12 +223,17 @@ def look(p: Pipeline, last: Sight, frame: Frame) -> Sight:
     if shift is not None and previous is not None and last.shift is not None:
         previous = move_neighbours(previous, shift.shift_px - last.shift.shift_px)
     found = p.tracker.follow(previous, last.appearance, frame, p.chip, p.calibration, p.robot, shift_px(shift))
-    return Sight(*found, background, shift)
+    tracers = None
+    if p.tracker.tracers:
+        tracers = p.tracker.tracer.follow(
+            last.tracers, found[0], frame, p.chip, p.calibration, p.robot, shift_px(shift)
+        )
+    return Sight(*found, background, shift, tracers)
 
 
 def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
     """Position of the robot, when it was last seen, and how it looks. A repeated image counts as not seen."""
-    previous, before = last.track, Sight(last.track, last.appearance, last.background, last.shift)
+    previous, before = last.track, Sight(*(getattr(last, name) for name in FROM_IMAGE))
     if inputs.applied.repeats_image and previous is not None:
         return before._replace(track=unseen(previous, inputs.stamp_ns))
     if inputs.frame is None:
@@ -277,7 +288,9 @@ def with_inputs(last: Tick, inputs: Inputs, topics: TopicTable = FIXED) -> Tick:
     new: dict[str, Any] = {name: message for name in HELD if (message := getattr(inputs, name)) is not None}
     if inputs.extra:
         new["extra"] = last.extra.with_messages(_of_source(inputs.extra, topics, Source.RIG))
-    return replace(last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, **new)
+    return replace(
+        last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, true_tracers=None, **new
+    )
 
 
 def recorded_extra(tick: Tick, inputs: Inputs, topics: TopicTable) -> Extra:
@@ -351,6 +364,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     if pump is not None:
         observations = p.pump.at_nominal(last.observations, observations, pump)
         tick = replace(tick, extra=tick.extra.with_messages({PUMP: pump}))
+    tracer_flow = collect_stretches(last.tracer_flow, last.tracers, sight.tracers) if p.tracker.tracers else None
     lap("observe")
     axes, driven_um_s = _axes(p, last, tick, track, rolled)
     mission = p.mission.update(
@@ -406,6 +420,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         demand=demand,
         currents=currents,
         axes=axes,
+        tracers=sight.tracers,
+        tracer_flow=tracer_flow,
     )
     if p.extra_stages:
         tick = _with_extra_stages(p, last, tick)

@@ -127,6 +127,9 @@ class Simulated:
     # The stage swings by this amplitude in a drawn direction, and the image with it.
     shake_um: Annotated[float, Range(0.0, 1e3)] | None = None
     shake_hz: _Rate | None = None  # mean frequency of the shaking of the image
+    tracers: Annotated[int, Range(0, 10_000)] = 0  # beads that drift with the flow, each at a height of its own
+    # density of the beads less that of the fluid: they settle; 50 is polystyrene in water, less in a matched fluid
+    tracer_excess_kg_m3: Annotated[float, Range(0.0, 2e4)] = 5.0
     image: SimulatedImage = field(default_factory=SimulatedImage)
     # how the robot is drawn: disc, the profile that the tracker fits; oblique, lit from one side
     optics: Optics | None = None

@@ -194,7 +194,8 @@ def _trial(
             if first is None:
                 first, begin_s, adopted = latest, time.monotonic(), _as_adopted(known, arrived.stamp_ns)
             last = step(pipeline, last, replace(arrived, **adopted))
-            writer.write(replace(last, truth=arrived.truth, true_field=arrived.true_field))
+            truth = {name: getattr(arrived, name) for name in ("truth", "true_field", "true_tracers")}
+            writer.write(replace(last, **truth))
             ticks += 1
             if control.reason:
                 return None

@@ -33,6 +33,7 @@ TRAIL = "camera/trail"
 ROBOT = "camera/robot"
 ROBOT_LABEL = "camera/robot label"
 COMMAND = "camera/commanded velocity"
+TRACERS = "camera/tracers"
 
 ASSUMED = "flow/assumed/speed"
 REFINED = "flow/refined/speed"

@@ -32,6 +32,7 @@ from flowrec.core import (
     Route,
     Tick,
     Timing,
+    Tracers,
     Track,
     completes_mission,
     message_fields,
@@ -129,8 +130,10 @@ _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 _SHOWN = (  # fields of a tick, in the order in which they are logged
     *("route", "mission", "track", "estimate", "demand", "applied", "currents"),
-    *("health", "timing", "event", "operator", "drops", "losses"),
+    *("health", "timing", "event", "operator", "drops", "losses", "tracers"),
 )
+_TRACER_S = 0.3  # way of a tracer that its arrow shows
+_LEAST_AGE = 3  # images that show a tracer before it is drawn
 _WORD_SHARE = 0.16, 0.12  # of the view: half the width, and the height, of the longest word about the robot
 
 
@@ -221,6 +224,8 @@ class TickLogger:
                     self._log_goal(goal_of(message))
             case Estimate():
                 self._log_estimate(message)
+            case Tracers():
+                self._log_tracers(message)
             case Demand():
                 self._log_demand(message)
             case Applied() if self._observes:  # nothing is commanded: the log of a movie says what the coils did
@@ -337,6 +342,14 @@ class TickLogger:
         self._scalars(e.FLOW_SPEED, *speeds)
         if math.isfinite(estimate.nis):
             self._scalars(e.NIS, estimate.nis)
+
+    def _log_tracers(self, tracers: Tracers) -> None:
+        """An arrow from each tracer to where it will be soon."""
+        drawn = tracers.age_frames >= _LEAST_AGE
+        origins = self._scene.to_plane(place_on_chip(self._tick, tracers.position_um[drawn]))
+        ways = self._scene.directions(self._scene.length_px(1.0) * _TRACER_S * tracers.velocity_um_s[drawn])
+        drawing = rr.Arrows2D(origins=origins, vectors=ways, colors=colours.YELLOW, radii=points(1.0), draw_order=27.0)
+        self._log(e.TRACERS, drawing)
 
     def _place_of_word(self, centre: Floats) -> Floats:
         """Position of a word about the robot at which neither the view's border nor the second session's robot cuts it.

@@ -10,7 +10,16 @@ Points are (x, y); arrays are [row, column] = [y, x]. Stamps are nanoseconds on 
 
 from flowrec.core.messages.control import AxesCheck, Currents, Demand, Event, Mission
 from flowrec.core.messages.estimation import Estimate, Health, Observations
-from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, Measured, OperatorEvent, Truth, pixel_type
+from flowrec.core.messages.rig import (
+    PIXEL_BITS,
+    Applied,
+    Frame,
+    Measured,
+    OperatorEvent,
+    TracerTruth,
+    Truth,
+    pixel_type,
+)
 from flowrec.core.messages.slow_stages import FlowField, Route
 from flowrec.core.messages.streams import (
     BY_STREAM,
@@ -24,7 +33,7 @@ from flowrec.core.messages.streams import (
     Samples,
     StreamStates,
 )
-from flowrec.core.messages.vision import Appearance, Background, Shift, Track, shift_px
+from flowrec.core.messages.vision import Appearance, Background, Shift, Tracers, Track, shift_px
 
 __all__ = [
     "BY_STREAM",
@@ -55,6 +64,8 @@ __all__ = [
     "Samples",
     "Shift",
     "StreamStates",
+    "TracerTruth",
+    "Tracers",
     "Track",
     "Truth",
     "pixel_type",

@@ -106,6 +106,25 @@ class Observations(Message):
     radius_um: Annotated[float | None, "radius of the robot, which the flow carries as a sphere; None: not stated"] = (
         None
     )
+    tracer: Annotated[
+        Vector | None,
+        Shape("n"),
+        "number of the tracer that was observed; -1: the robot; None: all are of the robot",
+    ] = None
+    entered: Annotated[
+        Vector | None, Shape("n"), "1 for a tracer that came in while it was watched, see Tracers; None: no tracers"
+    ] = None
+
+    def with_tracers(self, tracers: Observations | None) -> Observations:
+        """The observations of the robot, then those of tracers, which roll nowhere; itself if there are none."""
+        if tracers is None or not len(tracers.std_um_s):
+            return self
+        none = np.full(len(self.std_um_s), -1.0)
+        own = replace(self, tracer=none, entered=np.zeros(len(none)))
+        if not len(none):
+            return replace(tracers, stamp_ns=self.stamp_ns)
+        more = replace(tracers, rolled_um_s=np.zeros_like(tracers.flow_um_s))
+        return replace(own.followed_by(more), stamp_ns=self.stamp_ns, radius_um=self.radius_um)
 
     def only(self, which: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some of the observations, chosen by an index of arrays."""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core.declarations import NOT_STATED, Image, Message, NanFloat, PerCoil, Shape, Vector, Vector2
+from flowrec.core.declarations import NOT_STATED, Image, Matrix, Message, NanFloat, PerCoil, Shape, Vector, Vector2
 from flowrec.core.enums import Action
 from flowrec.core.errors import RigError
 
@@ -126,3 +126,16 @@ class Truth(Message):
     flow_um_s: Annotated[Vector2, "true flow at the robot"]
     clearance_um: Annotated[NanFloat, "distance from the robot's surface to the nearest wall"]
     contacts: Annotated[int, "wall contacts so far"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TracerTruth(Message):
+    """Ground truth of the tracers of a simulated rig, a row each. Recorded for evaluation; no stage reads it."""
+
+    stamp_ns: int
+    id: Annotated[Vector, Shape("n"), "whole number of the body; one that enters anew has a new number"]
+    position_um: Annotated[Matrix, Shape("n", 2), "true position"]
+    velocity_um_s: Annotated[Matrix, Shape("n", 2), "true velocity"]
+    height_share: Annotated[Vector, Shape("n"), "height of the centre over the floor, of the channel's depth"]
+    radius_um: Annotated[Vector, Shape("n"), "radius"]
+    stuck: Annotated[Vector, Shape("n"), "1: it sticks to the floor; 0: it floats"]

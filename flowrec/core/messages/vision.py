@@ -1,4 +1,4 @@
-"""Messages of the stages that read the image: the track, the look of the robot, the shift of the image."""
+"""Messages of the stages that read the image: tracks of robot and tracers, the robot's look, the image's shift."""
 
 from __future__ import annotations
 
@@ -76,6 +76,33 @@ class Shift(Message):
     found: Annotated[bool, "False: the image is not like the background, and the shift is the one before"]
     alike: Annotated[float, "share of the background that agrees, 0 to 1"]
     rests: Annotated[bool, "the image rests: it did not move for a second, and small shifts are noise"] = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracers(Message):
+    """Tracks of all bodies in view but the robot, a row each: the state of a constant-velocity filter.
+
+    The covariance of position and velocity is the same along x and y.
+    """
+
+    stamp_ns: int
+    id: Annotated[Vector, Shape("n"), "whole number of the body, the same for as long as it is followed"]
+    position_um: Annotated[Matrix, Shape("n", 2), "position"]
+    velocity_um_s: Annotated[Matrix, Shape("n", 2), "velocity"]
+    std_um: Annotated[Vector, Shape("n"), "one standard deviation of the position, per component"]
+    velocity_std_um_s: Annotated[Vector, Shape("n"), "one standard deviation of the velocity, per component"]
+    shared_um2_s: Annotated[Vector, Shape("n"), "covariance of position and velocity, per component"]
+    age_frames: Annotated[Vector, Shape("n"), "number of images that showed it"]
+    lost_frames: Annotated[Vector, Shape("n"), "number of images in a row without it; 0: this one shows it"]
+    entered: Annotated[Vector, Shape("n"), "1: it came in through an opening or the edge of the image; 0: it was there"]
+    from_um: Annotated[Matrix, Shape("n", 2), "place at which the present stretch of its way begins"]
+    from_s: Annotated[Vector, Shape("n"), "time of that on the session clock"]
+    next_id: Annotated[int, "number of the next body"]
+
+    @property
+    def count(self) -> int:
+        """Number of bodies."""
+        return len(self.id)
 
 
 def shift_px(shift: Shift | None) -> tuple[float, float]:

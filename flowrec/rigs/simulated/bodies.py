@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import UM_PER_M, FlowField, bilinear, compiled
-from flowrec.physics import Chip, Robot, sample, velocity_at, walls_of
+from flowrec.physics import Chip, Opening, Robot, sample, velocity_at, walls_of
 from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Hindrance, hindered_velocity
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.world import true_pump
@@ -213,8 +213,9 @@ class Swimmer:
 
 
 @compiled
-def _drift(
+def carry(
     points: NDArray[np.float64],
+    share: NDArray[np.float64],
     velocity: NDArray[np.float32],
     wall_px: NDArray[np.float32],
     clearance: NDArray[np.float32],
@@ -222,14 +223,14 @@ def _drift(
     dt: float,
     lost: NDArray[np.bool_],
 ) -> None:
-    """Move points (n, 2) in um with the flow by dt in two steps; `lost` (n,) becomes True outside the fluid."""
+    """Move points (n, 2) in um with shares (n,) of the flow by dt, in two steps; `lost` (n,): outside the fluid."""
     height, width = clearance.shape
     for n in range(points.shape[0]):
         for _ in range(2):
             i, j = points[n, 0] / um_per_px, points[n, 1] / um_per_px
             vx, vy = velocity_at(velocity, wall_px, i, j)
-            points[n, 0] += 0.5 * dt * vx
-            points[n, 1] += 0.5 * dt * vy
+            points[n, 0] += 0.5 * dt * (share[n] * vx)
+            points[n, 1] += 0.5 * dt * (share[n] * vy)
         i, j = points[n, 0] / um_per_px, points[n, 1] / um_per_px
         lost[n] = not (-0.5 <= i <= width - 0.5 and -0.5 <= j <= height - 0.5) or bilinear(clearance, i, j) < 0.0
 
@@ -263,12 +264,14 @@ class Debris:
         self._field = field
         self._clearance = clearance_um
         self._lost = np.zeros(count, np.bool_)
+        self._whole = np.ones(count)
 
     def drift(self, dt_s: float) -> None:
         """Move all by dt; a particle that has left the chip enters again at an inlet."""
         moving = len(self.points_um) - self.still
-        _drift(
+        carry(
             self.points_um[:moving],
+            self._whole,
             self._field.velocity_um_s,
             walls_of(self._field),
             self._clearance,
@@ -277,14 +280,19 @@ class Debris:
             self._lost,
         )
         for n in np.flatnonzero(self._lost).tolist():
-            inlet = self._inlets[int(self._rng.integers(len(self._inlets)))]
-            # More enter where the inflow is faster: the mean of three uniform draws is nearly a parabola.
-            along = inlet.first + (inlet.width_px - 1) * float(self._rng.random(3).mean())
-            height, width = self._chip.mask.shape
-            place = {
-                "left": (0.0, along),
-                "right": (width - 1.0, along),
-                "top": (along, 0.0),
-                "bottom": (along, height - 1.0),
-            }[inlet.side]
-            self.points_um[n] = np.array(place) * self._chip.um_per_px
+            self.points_um[n] = entry_um(self._chip, self._inlets, self._rng)
+
+
+def entry_um(chip: Chip, inlets: list[Opening], rng: np.random.Generator) -> NDArray[np.float64]:
+    """A drawn place (2,) at which a particle comes in: more enter where the inflow is faster."""
+    inlet = inlets[int(rng.integers(len(inlets)))]
+    # The mean of three uniform draws is nearly a parabola.
+    along = inlet.first + (inlet.width_px - 1) * float(rng.random(3).mean())
+    height, width = chip.mask.shape
+    place = {
+        "left": (0.0, along),
+        "right": (width - 1.0, along),
+        "top": (along, 0.0),
+        "bottom": (along, height - 1.0),
+    }[inlet.side]
+    return np.array(place) * chip.um_per_px

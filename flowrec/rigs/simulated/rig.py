@@ -32,10 +32,20 @@ from flowrec.core import (
     seconds,
 )
 from flowrec.physics import Calibration, Chip, Robot, check_point
+from flowrec.rigs.simulated.beads import Beads
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
 from flowrec.rigs.simulated.pump_sensor import PumpSensor
-from flowrec.rigs.simulated.world import Shake, TrueCoils, World, misregister, true_pump, true_robot, world_of
+from flowrec.rigs.simulated.world import (
+    Shake,
+    TrueCoils,
+    World,
+    misregister,
+    true_depth_um,
+    true_pump,
+    true_robot,
+    world_of,
+)
 from flowrec.rigs.streams.stream import SampleStream
 from flowrec.stages import (
     Coils,
@@ -230,7 +240,11 @@ class SimulatedRig:
         )
         debris = Debris(self._chip, self._simulated.image.debris, radius, field, walls, seed)
         microscope = self._microscope()
+        depth_um = true_depth_um(self._chip, self._simulated, radius)
+        beads = Beads(self._chip, self._simulated, radius, depth_um, field, walls, self.pump)
         moving = slice(0, len(debris.points_um) - debris.still)
+        radii = np.concatenate((debris.radii_um[moving], beads.radii_um))
+        darkness = np.concatenate((debris.darkness[moving], beads.darkness))
         for n in range(moving.stop, len(debris.points_um)):
             microscope.add_still(debris.points_um[n], float(debris.radii_um[n]), float(debris.darkness[n]))
         debris.drift(0.0)  # compiles, so that the second frame is not late
@@ -244,14 +258,15 @@ class SimulatedRig:
             elapsed = seconds(stamp - self._now_ns)
             if elapsed > 0:
                 debris.drift(elapsed)
+                beads.drift(elapsed)
             self._now_ns = stamp
             image = microscope.image(
                 None if swimmer.gone else swimmer.position_um,
                 radius,
                 (swimmer.position_um - before) / elapsed if elapsed > 0 else np.zeros(2),
-                debris.points_um[moving],
-                debris.radii_um[moving],
-                debris.darkness[moving],
+                np.concatenate((debris.points_um[moving], beads.points_um)),
+                radii,
+                darkness,
                 None if self._shake is None else self._shake.at(seconds(stamp)),
             )
             arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
@@ -270,6 +285,7 @@ class SimulatedRig:
                 applied=self._field_message(stamped, turns),
                 truth=Truth(stamped, swimmer.position_um, swimmer.flow_um_s, swimmer.clearance_um, swimmer.contacts),
                 true_field=field if index == 0 else None,
+                true_tracers=beads.truth(stamped) if self._simulated.tracers else None,
                 clock=fit,
             )
             index += 1

@@ -60,6 +60,9 @@ SPHERE = (0.5, 0.3)
 # Of the own motion, per unit of the drag of the side walls: a roller's floor has 2.2 to 3.4 times Stokes' drag at gaps
 # of a tenth to a hundredth of its radius (Goldman, Cox and Brenner 1967), which the walls' drag adds to.
 HELD = (0.3, 1.0)
+# Of the flow, one value a tracer: between plates 0.45 of those in view at first, 0.27 of those that came in later
+# (tracer_heights.py). In a deep channel less, with beads of other sizes and laws more.
+HEIGHT = (0.3, 0.5)
 OFFSET_PX = (0.3, 1.0)  # registration to a fraction of a pixel of the mask
 SCALE = (0.006, 1.0)  # um per pixel of a camera
 ANGLE = (0.004, 0.8)  # rad
@@ -164,6 +167,9 @@ class Observed:
         here, *shifted = operator.beside(_HALF_PIXEL, model.expansion.wall_px, mask)
         clearance = np.minimum(clearance_um(mask, 1.0), np.float32(max(mask.shape)))
         distance = np.maximum(cells_at(operator.points, mask.shape).interpolate(clearance), 0.0)
+        rolls = np.ones(len(distance)) if operator.tracer is None else (operator.tracer < 0.0).astype(np.float64)
+        if rolls.any() and not rolls.all():  # a tracer is no sphere of the robot's radius
+            distance = np.where(rolls > 0.0, distance, float(distance[rolls > 0.0].max()))
         least = max(float(distance.min()), 0.5)
         sphere = None
         if operator.radius_px is None:
@@ -262,6 +268,9 @@ class Observed:
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
         noise = float(np.median(here.std_um_s))
+        if here.tracer is not None:
+            same = _of_components((here.tracer[:, None] == here.tracer) & (here.tracer >= 0.0))
+            found.append(Effect("height", *HEIGHT, np.zeros((0, v.size)), v.ravel()[:, None] * v.ravel() * same))
         found += [_effect(name, (DISTURBED[0] * noise, DISTURBED[1]), every) for name, every in here.disturbances]
         return [
             replace(effect, median=self.usual * effect.median) if effect.name in _STATED else effect for effect in found
@@ -274,11 +283,17 @@ class Observed:
         bent[pixels] = curvature(self.model.chip.mask, flow, pixels)
         laplacian = self.operator.predict(bent)
         if self.sphere is not None:
-            return [_effect("sphere", SPHERE, self.sphere.transport_slip(v, laplacian)[None])]
+            return [_effect("sphere", SPHERE, (self.rolls * self.sphere.transport_slip(v, laplacian))[None])]
         return [
-            _effect("carry", CARRY, -(self.near[:, None] * v)[None]),
-            _effect("curved", CURVED, (self.least_px**2 / 6.0 * laplacian)[None]),
+            _effect("carry", CARRY, -(self.rolls * self.near[:, None] * v)[None]),
+            _effect("curved", CURVED, (self.least_px**2 / 6.0 * self.rolls * laplacian)[None]),
         ]
+
+    @property
+    def rolls(self) -> Floats:
+        """(n, 1) 1 for observations of the robot, 0 for those of tracers."""
+        tracer = self.operator.tracer
+        return np.ones((self.operator.count, 1)) if tracer is None else (tracer[:, None] < 0.0).astype(np.float64)
 
     def _hindrance_size(self) -> tuple[float, float]:
         """Size of the hindrance of the own motion: median and ln_std."""

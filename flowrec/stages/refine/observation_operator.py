@@ -31,6 +31,7 @@ class ObservationOperator:
     time_s: Floats | None = None  # (n,)
     radius_px: float | None = None  # of the robot; None: not stated
     disturbances: tuple[Disturbance, ...] = ()  # see disturbances.py
+    tracer: Floats | None = None  # (n,) number of the tracer that was observed, -1: the robot; None: all are of it
 
     @property
     def count(self) -> int:
@@ -68,6 +69,7 @@ class ObservationOperator:
             std_um_s=self.std_um_s[first],
             rolled_um_s=None if self.rolled_um_s is None else self.rolled_um_s[first],
             time_s=None if self.time_s is None else self.time_s[first],
+            tracer=None if self.tracer is None else self.tracer[first],
         )
 
     def with_walls(self, wall_px: NDArray[np.float32]) -> ObservationOperator:
@@ -139,6 +141,7 @@ def observation_operator(
         None if observations.rolled_um_s is None else observations.rolled_um_s[usable],
         None if observations.time_s is None else observations.time_s[usable],
         None if observations.radius_um is None else observations.radius_um / um_per_px,
+        tracer=None if observations.tracer is None else observations.tracer[usable],
     )
 
 

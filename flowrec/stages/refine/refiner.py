@@ -21,6 +21,7 @@ from flowrec.stages.refine.ni import Ni
 from flowrec.stages.refine.observation_operator import ObservationOperator, observation_operator
 from flowrec.stages.refine.pi_unet import PiUnet
 from flowrec.stages.refine.pinn import Pinn
+from flowrec.stages.refine.tracer_heights import at_mean_height
 from flowrec.stages.refine.uncertainty import flow_uncertainty
 from flowrec.stages.refine.unet import Unet
 
@@ -156,6 +157,7 @@ class Refiner:
                 f"the assumed field has {assumed.velocity_um_s.shape[:2]} pixels and the mask of chip '{chip.name}' "
                 f"{chip.mask.shape}: solve the flow again for this chip"
             )
+        observations = at_mean_height(observations, assumed, chip)
         operator = observation_operator(observations, chip.mask, chip.um_per_px, assumed.wall_px)
 
         def fit_assimilation(obstacles: bool) -> tuple[FlowField, ObservationOperator]:
@@ -202,6 +204,7 @@ class Refiner:
 
         None where nothing says how wrong the assumed flow may be.
         """
+        observations = at_mean_height(observations, assumed, chip)
         operator = observation_operator(observations, chip.mask, chip.um_per_px, assumed.wall_px)
         return flow_uncertainty(self.assimilate, operator, chip, solver)
 

@@ -13,7 +13,7 @@ Learned appearance (learned.py): for a robot that a user has pointed at, and for
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -46,6 +46,7 @@ from flowrec.stages.vision.learned import (
     with_motion,
 )
 from flowrec.stages.vision.learning import box_of, brightest_spot, energy_of, learn, pixel_noise
+from flowrec.stages.vision.tracers import TracerTracker
 from flowrec.stages.vision.trackers import TRACKERS, TrackingMethod
 from flowrec.stages.vision.walls import Box, Walls, walls_in_view
 
@@ -132,6 +133,8 @@ class Tracker:
     click_frame: Annotated[int, Range(0, 2**62)] | None = None  # index of the image of click_px; None: the first one
     # the walls of the mask may be off by this many robot radii; ignored where polarity is None
     wall_error_radii: Annotated[float, Range(0.0, 2.0)] = 0.5
+    tracers: bool = False  # all other bodies are followed, too: beads that drift show the flow
+    tracer: TracerTracker = field(default_factory=TracerTracker)
 
     @property
     def _other(self) -> TrackingMethod | None:
@@ -195,7 +198,7 @@ class Tracker:
 
     def footprint(self, chip: Chip, calibration: Calibration, robot: Robot, shape: tuple[int, int]) -> Footprint:
         """The pixels of an image of `shape` that can influence a track, whatever the image shows."""
-        if self._other is not None:
+        if self._other is not None or self.tracers:
             return Footprint(max(shape), (0, 0, shape[1], shape[0]))
         pad_px = disc_pad_px(robot.radius_um / calibration.um_per_px)
         if self.polarity is not None:

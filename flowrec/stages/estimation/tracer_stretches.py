@@ -1,0 +1,50 @@
+"""Tracers to Observations: the mean velocity of each tracer over each stretch of its way."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flowrec.core import Observations, Tracers
+
+CAPACITY = 2000  # the oldest are dropped first
+_LEAST_MOVED = 5.0  # standard deviations of the distance: what has not moved so far is stuck
+_SETTLED = 2.0  # images: a first stretch begins with the third, see vision/tracers.py
+_FLOOR_UM_S = 2.0  # least sigma of an observation
+
+
+def collect_stretches(
+    previous: Observations | None, before: Tracers | None, tracers: Tracers | None
+) -> Observations | None:
+    """The observations after this frame; the previous object itself when no stretch has ended.
+
+    A stretch has ended for each tracer of `tracers` that begins another one, see `Tracers.from_um`. The place is the
+    middle of its ends, the standard deviation that of their difference. One that has not moved tells no flow: it sticks
+    to the floor.
+    """
+    if before is None or tracers is None or tracers is before or not before.count:
+        return previous
+    where = np.searchsorted(before.id, tracers.id)  # numbers are in order
+    known = before.id[np.minimum(where, before.count - 1)] == tracers.id
+    old = where[known]
+    began_s, ended_s = before.from_s[old], tracers.from_s[known]
+    began_um, ended_um = before.from_um[old], tracers.from_um[known]
+    std_um = np.sqrt(2.0) * tracers.std_um[known]
+    # The first stretch begins where the velocity has settled.
+    settled = before.age_frames[old] > _SETTLED
+    moved = np.hypot(*(ended_um - began_um).T) > _LEAST_MOVED * std_um
+    over = (ended_s > began_s) & moved & settled
+    if not over.any():
+        return previous
+    lasted_s = (ended_s - began_s)[over]
+    new = Observations(
+        tracers.stamp_ns,
+        0.5 * (began_um + ended_um)[over],
+        (ended_um - began_um)[over] / lasted_s[:, None],
+        np.hypot(std_um[over] / lasted_s, _FLOOR_UM_S),
+        None,
+        0.5 * (began_s + ended_s)[over],
+        None,
+        tracers.id[known][over],
+        tracers.entered[known][over],
+    )
+    return new if previous is None else previous.followed_by(new).only(slice(-CAPACITY, None))

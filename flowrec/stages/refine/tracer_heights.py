@@ -1,0 +1,84 @@
+"""Observations of tracers at unknown heights, as observations of the flow's mean over the depth.
+
+A tracer at the height z of a channel of depth h goes with c times the mean over the depth, between plates
+c = 3/2 (1 - (2 z / h - 1)^2). Beads that are spread evenly over the depth have E c = 1, E c^2 = 6/5, E c^3 = 54/35.
+So have those that are in view at the first image. As many come in at each height as flow through there, so c of
+those that came in later has the mean E c^2 / E c = 1.2 and the variance E c^3 - 1.2^2 = 0.103; they make up most of a
+long run. A tracer stays at its height, so one error belongs to all of its observations: Gaussian here, of the size that
+the observations show (`HEIGHT` of causes.py). In a channel that is not shallow the profile is flatter, and where no
+depth is stated it may be flat: the part of this scatter that tracers show around an assumed flow is used for the mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flowrec.core import Floats, FlowField, Ints, Observations, cells_at
+from flowrec.physics import Chip, clearance_um, sample
+
+EVEN = (1.0, float(np.sqrt(0.2)))  # mean and standard deviation of c of tracers in view at first
+ENTERED = (1.2, float(np.sqrt(54.0 / 35.0 - 1.44)))  # of those that came in later
+MOST_EACH = 6  # observations of one tracer: more tell no more of the flow than its height permits
+# Of a tracer's speed, one standard deviation by which c differs along its way: it settles, and lags near side walls.
+VARIES_SHARE = 0.1
+# Pixels of the mask from a wall: nearer to it than walls may be off, a predicted speed says nothing of a tracer's.
+LEAST_PX = 2.0
+MOST = 100  # of all tracers, the latest first: the time of a refinement grows with the square
+
+
+def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -> Observations:
+    """The observations with those of tracers divided by the mean of c; themselves without tracers."""
+    if observations.tracer is None or observations.entered is None:
+        return observations
+    clear_px = clearance_um(chip.mask, 1.0)
+    away_px = cells_at(observations.position_um / chip.um_per_px, chip.mask.shape).interpolate(clear_px)
+    observations = observations.only((observations.tracer < 0.0) | (away_px > LEAST_PX))
+    assert observations.tracer is not None
+    observations = observations.only(_few_of_each(observations.tracer))
+    tracer, entered = observations.tracer, observations.entered
+    assert tracer is not None and entered is not None
+    beads = tracer >= 0.0
+    if not beads.any():
+        return observations
+    flat = 1.0 if chip.depth_um is not None else _profile_share(observations.only(beads), assumed)
+    mean = 1.0 + flat * (np.where(entered > 0.0, ENTERED[0], EVEN[0]) - 1.0)
+    mean = np.where(beads, mean, 1.0)
+    flow_um_s = observations.flow_um_s / mean[:, None]
+    varied = np.where(beads, VARIES_SHARE * np.hypot(*flow_um_s.T), 0.0)
+    return replace(observations, flow_um_s=flow_um_s, std_um_s=np.hypot(observations.std_um_s / mean, varied))
+
+
+def _few_of_each(tracer: Floats) -> Ints:
+    """(k,) indices of the observations of the robot, then of the latest tracers, evenly along the way of each."""
+    chosen = [np.flatnonzero(tracer < 0.0)]
+    numbers = np.unique(tracer[tracer >= 0.0])[-MOST:]
+    each = min(max(MOST // max(len(numbers), 1), 1), MOST_EACH)
+    for number in numbers:
+        own = np.flatnonzero(tracer == number)
+        inner = (np.arange(min(each, len(own))) + 0.5) / min(each, len(own))
+        chosen.append(own[(inner * len(own)).astype(np.intp)])
+    return np.concatenate(chosen)
+
+
+def _profile_share(beads: Observations, assumed: FlowField) -> float:
+    """Part of the variance of c between plates that the tracers show, from 0 for a flat profile to 1.
+
+    By the ratio of each tracer's speed to the assumed one there, and its median absolute deviation from their median:
+    an assumed flow that is wrong by one factor leaves it.
+    """
+    predicted = sample(assumed, beads.position_um)
+    assert beads.tracer is not None and beads.entered is not None
+    index = np.unique(beads.tracer, return_inverse=True)[1]
+    along = np.bincount(index, (predicted * beads.flow_um_s).sum(axis=1))
+    power = np.bincount(index, (predicted**2).sum(axis=1))
+    flows = power > 1e-6 * max(float(power.max()), 1e-12)
+    if np.count_nonzero(flows) < 3:
+        return 1.0
+    ratio = along[flows] / power[flows]
+    middle = float(np.median(ratio))
+    scatter = 1.4826 * float(np.median(np.abs(ratio - middle))) / max(abs(middle), 1e-9)
+    came_in = float(np.bincount(index, beads.entered)[flows].astype(bool).mean())
+    plates = came_in * (ENTERED[1] / ENTERED[0]) ** 2 + (1.0 - came_in) * EVEN[1] ** 2
+    return float(np.clip(scatter**2 / plates, 0.0, 1.0))

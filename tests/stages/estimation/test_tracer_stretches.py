@@ -1,0 +1,42 @@
+"""Stretches of the ways of tracers as observations of the flow."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flowrec.core import NS_PER_S, Tracers
+from flowrec.stages.estimation.tracer_stretches import collect_stretches
+
+
+def tracers(time_s: float, from_um: list, from_s: list, position_um: list, age: float = 20.0) -> Tracers:
+    """Two bodies, the numbers 4 and 7."""
+    one, place = np.ones(2), np.array(position_um, float)
+    return Tracers(
+        round(time_s * NS_PER_S), np.array([4.0, 7.0]), place, np.zeros((2, 2)), one, one, one, age * one, 0 * one,
+        np.array([0.0, 1.0]), np.array(from_um, float), np.array(from_s, float), 8,
+    )  # fmt: skip
+
+
+START = [[0.0, 0.0], [10.0, 0.0]]
+
+
+def test_a_stretch_gives_its_mean_velocity_in_its_middle_and_its_body() -> None:
+    before = tracers(1.9, START, [1.0, 1.0], [[90.0, 0.0], [11.0, 0.0]])
+    after = tracers(2.0, [[100.0, 40.0], [10.0, 0.0]], [2.0, 1.0], [[100.0, 40.0], [11.0, 0.0]])
+    found = collect_stretches(None, before, after)
+    assert found.flow_um_s.tolist() == [[100.0, 40.0]] and found.position_um.tolist() == [[50.0, 20.0]]
+    assert found.tracer.tolist() == [4.0] and found.entered.tolist() == [0.0] and found.time_s.tolist() == [1.5]
+    np.testing.assert_allclose(found.std_um_s, [np.hypot(np.sqrt(2.0), 2.0)])
+    assert collect_stretches(found, after, after) is found
+    twice = collect_stretches(found, before, after)
+    assert len(twice.std_um_s) == 2
+
+
+def test_what_sticks_or_is_new_tells_no_flow() -> None:
+    before = tracers(1.9, START, [1.0, 1.0], START)
+    stuck = tracers(2.0, [[3.0, 0.0], [10.0, 3.0]], [2.0, 2.0], [[3.0, 0.0], [10.0, 3.0]])
+    assert collect_stretches(None, before, stuck) is None
+    new = tracers(1.9, START, [1.0, 1.0], START, age=2.0)
+    moved = tracers(2.0, [[100.0, 0.0], [10.0, 0.0]], [2.0, 1.0], START)
+    assert collect_stretches(None, new, moved) is None
+    assert collect_stretches(None, before, moved) is not None
