@@ -138,7 +138,8 @@ class Pipeline:
 
 def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     """The stages of a resolved configuration on its chip."""
-    config.pump.refuse_unfit(chip, config.streams, inertia=config.flow.convection)
+    inertia, tracers = config.flow.convection, config.tracker.tracers
+    config.pump.refuse_unfit(chip, config.streams, inertia=inertia, tracers=tracers)
     return Pipeline(
         chip=chip,
         calibration=calibration_of(config, chip),

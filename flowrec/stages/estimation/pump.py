@@ -37,9 +37,7 @@ from flowrec.stages.estimation.kalman import memory_s
 
 _SLOW_S = 5.0  # memory of the mean that plans are made with
 _REYNOLDS = 1.0  # above it a flow is not proportional to the speed at its inlets
-_LEAST = (
-    0.02  # of the share; observations of a flow that nearly stands still say nothing of the flow at the nominal one
-)
+_LEAST = 0.02  # of the share; a flow that nearly stands still says nothing of the flow at the nominal one
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +51,7 @@ class PumpFollower:
     delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # from a change of the flow to the sample that shows it
     smoothing_s: Annotated[float, Range(0.0, 60.0)] = 0.05  # memory of the mean over samples
 
-    def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool) -> None:
+    def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool, tracers: bool) -> None:
         """Raise UsageError where the flow of a chip does not follow its pump by a factor, or no stream measures it."""
         if not self.channel:
             return
@@ -63,6 +61,10 @@ class PumpFollower:
             there = ", ".join(sorted(streams)) or "none"
             raise UsageError(f"{where}: there is no section [streams.{name}]; there are {there}")
         outlets = {opening.value for opening in chip.openings if opening.kind == "outlet"}
+        if tracers:
+            raise UsageError(
+                f"{where}: observations of tracers are not divided by the pump's share; set tracker.tracers = false"
+            )
         reason = ""
         if len(outlets) > 1:
             reason = "its outlets have different pressures"

@@ -122,6 +122,8 @@ def test_a_flow_that_does_not_follow_its_pump_by_a_factor_is_refused(
 ) -> None:
     pump = PumpFollower("pump/flow")
     with pytest.raises(UsageError, match=complaint):
-        pump.refuse_unfit(chip, streams, inertia=True)
-    pump.refuse_unfit(channel(), ("pump",), inertia=True)
-    PumpFollower().refuse_unfit(chip, (), inertia=True)
+        pump.refuse_unfit(chip, streams, inertia=True, tracers=False)
+    pump.refuse_unfit(channel(), ("pump",), inertia=True, tracers=False)
+    with pytest.raises(UsageError, match="tracers are not divided by the pump"):
+        pump.refuse_unfit(channel(), ("pump",), inertia=True, tracers=True)
+    PumpFollower().refuse_unfit(chip, (), inertia=True, tracers=True)
