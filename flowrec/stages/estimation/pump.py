@@ -63,7 +63,7 @@ class PumpFollower:
         outlets = {opening.value for opening in chip.openings if opening.kind == "outlet"}
         if tracers:
             raise UsageError(
-                f"{where}: observations of tracers are not divided by the pump's share; set tracker.tracers = false"
+                f"{where}: what tracers tell does not follow the pump; set tracker.tracers = false"
             )
         reason = ""
         if len(outlets) > 1:

@@ -124,6 +124,6 @@ def test_a_flow_that_does_not_follow_its_pump_by_a_factor_is_refused(
     with pytest.raises(UsageError, match=complaint):
         pump.refuse_unfit(chip, streams, inertia=True, tracers=False)
     pump.refuse_unfit(channel(), ("pump",), inertia=True, tracers=False)
-    with pytest.raises(UsageError, match="tracers are not divided by the pump"):
+    with pytest.raises(UsageError, match="what tracers tell does not follow the pump"):
         pump.refuse_unfit(channel(), ("pump",), inertia=True, tracers=True)
     PumpFollower().refuse_unfit(chip, (), inertia=True, tracers=True)
