@@ -69,8 +69,8 @@ NOT_STATED: Any = ()  # default of a vector, which the message makes (0,)
 
 
 def coil_names(count: int) -> tuple[str, ...]:
-    """Names of so many coils, as in columns of tables: of three x, y and z, else their numbers from 1."""
-    return ("x", "y", "z") if count == 3 else tuple(str(number) for number in range(1, count + 1))
+    """Names of so many coils, as in columns of tables: x, y and z of two or three, else their numbers from 1."""
+    return ("x", "y", "z")[:count] if count in (2, 3) else tuple(str(number) for number in range(1, count + 1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from flowrec.stages import Coils
 _MU0_MT_MM_PER_A = 4e-1 * math.pi  # mu0 in mT mm/A
 _KINDS = {"helmholtz": 1.0, "maxwell": math.sqrt(3.0), "pair": None, "coil": None}  # distance over radius, if it is set
 _FORM = "AXIS:KIND:RADIUS_MM:TURNS[:DISTANCE_MM]"
-_DIGITS = 6
+_DIGITS = 6  # of the numbers that are printed; a winding is known to three
 
 
 class Winding(NamedTuple):

@@ -45,7 +45,7 @@ class PumpSensorSettings:
 
     rate_hz: Annotated[float, Range(0.01, 1e4)] = 10.0  # samples per second
     noise_share: Annotated[float, Range(0.0, 1.0)] = 0.01  # standard deviation of a sample, as a ratio of the flow
-    delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # from the flow to the sample that shows it
+    delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # time from a change of the flow to the sample that shows it
 
 
 @dataclass(frozen=True, slots=True)

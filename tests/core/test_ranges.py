@@ -81,6 +81,8 @@ def judge(key: str, hint: Any, default: Any) -> None:
         default = (0.0, 0.0)
     if key == "tracker.box_px":
         default = (0.0, 0.0, 0.0, 0.0)
+    if key == "robot.speed_at_hz":
+        default = ((5.0, 100.0),)
     if key.endswith((".rates_1_s", ".ratios")):
         default = (1.0,)
     whole = isinstance(valid.low, int)

@@ -27,7 +27,15 @@ def ordered(survey, planner, limit_hz=None, speed_limit_um_s=None):
     tick = SimpleNamespace(
         estimate=SimpleNamespace(covariance=np.eye(4)),
         health=SimpleNamespace(limit_hz=limit_hz),
-        **{"field": 1, "assumed": 1, "route": None, "demand": None, "observations": None, "stamp_ns": 0},
+        **{
+            "field": 1,
+            "assumed": 1,
+            "route": None,
+            "demand": None,
+            "observations": None,
+            "tracer_flow": None,
+            "stamp_ns": 0,
+        },
     )
     mission = SimpleNamespace(
         phase=Phase.START, start_um=np.zeros(2), goal_um=np.ones(2), speed_limit_um_s=speed_limit_um_s

@@ -15,7 +15,17 @@ from typer.testing import CliRunner
 
 from flowrec.core.declarations import Role
 from flowrec.core.diagnostics import CameraLosses, Clocks, Drops
-from flowrec.core.messages import Appearance, AxesCheck, Background, Health, Shift
+from flowrec.core.messages import (
+    Appearance,
+    AxesCheck,
+    Background,
+    Health,
+    Measured,
+    Observations,
+    Shift,
+    Tracers,
+    TracerTruth,
+)
 from flowrec.core.topics import TOPICS, Tick
 from flowrec.physics.chip.io import load_chip
 from flowrec.stages.config import load_config
@@ -59,8 +69,15 @@ def every_topic() -> list[Tick]:
         np.eye(2), 0.1, np.ones(2), "agrees", "as stated",
     )  # fmt: skip
     seen = {"background": Background(now, np.ones((3, 5)), 1.0), "shift": Shift(now, np.ones(2), True, 0.9)}
+    two, places = np.array([1.0, 2.0]), np.array([[10.0, 20.0], [30.0, 40.0]])
+    bodies = {
+        "measured": Measured(now, np.arange(3.0), np.arange(3.0)),
+        "tracers": Tracers(now, two, places, places, two, two, two, two, two, two, places, two, 3),
+        "tracer_flow": Observations(now, places, places, two, None, two, None, two, two),
+        "true_tracers": TracerTruth(now, two, places, places, 0.3 * two, two, two),
+    }
     more = {"health": health, "clocks": clocks, "drops": drops, "losses": losses, "appearance": look, "axes": axes}
-    return [replace(tick, mapless=tick.estimate, **more, **seen) for tick in ticks]
+    return [replace(tick, mapless=tick.estimate, **more, **seen, **bodies) for tick in ticks]
 
 
 @pytest.fixture(scope="module")
@@ -247,8 +264,9 @@ def test_an_edit_that_no_replay_can_see_fails_verify_by_the_digest(session: Path
 def test_the_replay_itself_finds_an_edit_of_each_topic_that_it_computes(session: Path, tmp_path: Path) -> None:
     edited: set[str] = set()
     # The map of this mission is not good enough for the observer, so nothing is computed without it. It neither checks
-    # the axes nor registers images.
+    # the axes nor registers images, and follows no tracers.
     absent = {"/robot/estimate_without_map", "/run/axes", "/camera/background", "/camera/shift"}
+    absent |= {"/tracers/tracks", "/tracers/observations"}
     computed = {topic.path for topic in TOPICS if topic.role is Role.OUTPUT} - absent
 
     def edit(channel: Any, message: Any, wire: Any) -> bool:

@@ -162,9 +162,9 @@ class Drive:
             self._accounted = (before_ns, stamp_ns, result.turns)
         return replace(result, turns=result.turns + late)
 
-    def measured(self) -> Measured | None:
+    def read_back(self) -> Measured | None:
         """The latest measurement of the currents; None: there is none, or the amplifier does not measure."""
-        measured: Measured | None = self._amplifier.measured() if self.info.measures else None  # type: ignore[attr-defined]
+        measured: Measured | None = self._amplifier.read_back() if self.info.measures else None  # type: ignore[attr-defined]
         return measured
 
     def _look_for_field(self, log: FieldLog) -> None:
@@ -216,7 +216,7 @@ class Drive:
         try:
             # The guardian knows first, so that no field is on without it.
             guardian.beat(energised=now_s < self._on_until_s)
-            fault = self._read_back.fault(self.measured())
+            fault = self._read_back.fault(self.read_back())
             if fault:
                 raise RigError(f"{self.info.model}: {fault}")
             self._amplifier.apply(command)

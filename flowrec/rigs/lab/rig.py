@@ -171,7 +171,7 @@ class LabRig:
             applied = self._field_between(session, stamp_ns, before_ns)
             applied = replace(applied, absent_until_ns=absent_until_ns)
             if frame is None:
-                yield Inputs(stamp_ns, None, applied, measured=self._measured(session), delays=self._delays())
+                yield Inputs(stamp_ns, None, applied, measured=self._new_measurement(session), delays=self._delays())
             else:
                 losses, before = session.losses(frame.losses), losses
                 if losses is not before:  # about once a second
@@ -182,7 +182,7 @@ class LabRig:
                     applied,
                     clock=session.fit(frame.clock),
                     losses=losses,
-                    measured=self._measured(session),
+                    measured=self._new_measurement(session),
                     delays=self._delays(frame),
                 )
             before_ns = stamp_ns
@@ -271,9 +271,9 @@ class LabRig:
         if self.drive is not None:
             self.drive.beat()
 
-    def _measured(self, session: _Session) -> Measured | None:
+    def _new_measurement(self, session: _Session) -> Measured | None:
         """The latest measurement of the currents, on the session clock; None: none is new."""
-        measured = None if self.drive is None else self.drive.measured()
+        measured = None if self.drive is None else self.drive.read_back()
         if measured is None or measured is self._told_measured:
             return None
         self._told_measured = measured

@@ -26,11 +26,11 @@ from flowrec.stages import Simulated
 
 _STREAM = 9  # of the seed
 _RADII = (0.2, 0.3)  # of the robot's radius: the two sizes
-_DARKNESS = (0.35, 0.6)
+_DARKNESS = (0.35, 0.6)  # of a bead against the channel, least and most; the robot's is 1
 _STUCK_SHARE = 0.05  # of the beads from the start
 _TOUCH = 1.005  # radii between the centre and the floor of a bead that lies there
 _STICKS_PER_S = 0.05  # rate at which a bead that lies on the floor sticks
-_G_M_S2 = 9.81
+_G_M_S2 = 9.81  # standard gravity
 
 
 class Beads:

@@ -13,8 +13,8 @@ from flowrec.core import UsageError
 from flowrec.rigs.streams.stream import Chunk, StreamHead
 from flowrec.stages import LOG, StreamSettings
 
-_MOST_CHANNELS = 1000
-_NAME_LIMIT = 100
+_MOST_CHANNELS = 1000  # of a run: one is a name, and whoever puts a time into names finds out
+_NAME_LIMIT = 100  # letters of a name
 
 
 class RunLog:

@@ -23,7 +23,7 @@ from flowrec.stages.control.field_rotation import FieldCommand, FieldState, fiel
 
 _Row = tuple[float, ...]
 _Matrix = tuple[_Row, _Row, _Row]
-_AXES = 3
+_AXES = 3  # of the field
 _LEAST_ROW = 1e-9  # A per mT of a coil that makes no field, such as a Maxwell pair
 _PER_COIL = ("a_per_v", "v_per_v", "resistance_ohm", "inductance_mh")  # settings of [coils.amplifier]
 _FADE_FRACTION = 0.1  # below this fraction of the full amplitude the bias compensation fades with the field

@@ -48,7 +48,7 @@ class PumpFollower:
     # value of the channel, in its unit, at which the inlets have the speeds that the chip states
     nominal: Annotated[float, Range(1e-12, 1e12)] = 1.0
     error_share: Annotated[float, Range(0.0, 1.0)] = 0.02  # standard deviation of the measured value, as a ratio
-    delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # from a change of the flow to the sample that shows it
+    delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # time from a change of the flow to the sample that shows it
     smoothing_s: Annotated[float, Range(0.0, 60.0)] = 0.05  # memory of the mean over samples
 
     def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool, tracers: bool) -> None:
@@ -62,9 +62,7 @@ class PumpFollower:
             raise UsageError(f"{where}: there is no section [streams.{name}]; there are {there}")
         outlets = {opening.value for opening in chip.openings if opening.kind == "outlet"}
         if tracers:
-            raise UsageError(
-                f"{where}: what tracers tell does not follow the pump; set tracker.tracers = false"
-            )
+            raise UsageError(f"{where}: what tracers tell does not follow the pump; set tracker.tracers = false")
         reason = ""
         if len(outlets) > 1:
             reason = "its outlets have different pressures"

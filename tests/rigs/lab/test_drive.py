@@ -170,7 +170,7 @@ def test_a_coil_that_has_half_of_its_current_is_noticed_by_its_sensor_and_ends_i
         for _ in range(60):
             drive.apply(currents(8.0, 0.0))
             time.sleep(0.015)
-        measured = drive.measured()
+        measured = drive.read_back()
         assert measured is not None and np.abs(measured.currents_a).max() > 1.0
         np.testing.assert_allclose(measured.currents_a, measured.put_out_a, atol=1e-4)
         fault.touch()

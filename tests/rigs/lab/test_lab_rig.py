@@ -86,6 +86,7 @@ class Noted:
         self.beats: list[float] = []
         self.beats_before_rest = self.looked_at = 0
         self.latest: Measured | None = None
+        self.field_ms: float | None = None
 
     def __enter__(self) -> Noted:
         self.calls.append("enter")
@@ -110,7 +111,7 @@ class Noted:
     def zero(self) -> None:
         self.calls.append("zero")
 
-    def measured(self) -> Measured | None:
+    def read_back(self) -> Measured | None:
         """Another measurement for every second frame."""
         if self.looked_at % 2 == 0:
             self.latest = Measured(time.monotonic_ns(), np.full(3, 0.1 * self.looked_at), np.zeros(3))

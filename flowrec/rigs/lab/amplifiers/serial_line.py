@@ -160,7 +160,7 @@ class SerialAmplifier:
         self._log.forget(until_ns - round(KEEP_S * NS_PER_S))
         return self._log
 
-    def measured(self) -> Measured | None:
+    def read_back(self) -> Measured | None:
         """The latest measurement, at the arrival of its answer."""
         return self._read_back
 
