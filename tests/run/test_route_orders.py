@@ -85,7 +85,7 @@ def test_a_pause_takes_nothing_from_the_time_of_a_survey():
         health=SimpleNamespace(limit_hz=None),
         route=SimpleNamespace(arrival_s=np.array([0.0, 7.0])),
         demand=SimpleNamespace(progress_s=4.0),
-        **{"field": 1, "observations": None},
+        **{"field": 1, "observations": None, "tracer_flow": None},
     )
     for held_ns in (0, 60_000_000_000):
         phase = {"phase": Phase.SURVEY, "since_ns": 5_000_000_000, "held_ns": held_ns}
