@@ -232,7 +232,8 @@ def test_recover_makes_a_run_whole_whatever_is_left_of_its_last_part(run, whole,
     (done,) = recover_run(run)
     assert done.path == last and not partial_path(last).exists()
     reader = SessionReader(run)
-    ticks = list(reader.ticks())
+    # Images may be on the disk before the rest of their ticks; a replay passes over these.
+    ticks = [tick for tick in reader.ticks() if tick.applied.stamp_ns == tick.stamp_ns]
     assert all(map(same, ticks, whole.ticks()))
     assert SessionReader(last).part == Part("one run", 4, keyframe_ns=TICKS[39].stamp_ns)
     assert len(ticks) == 40 + done.ticks == int(reader.outcome["ticks"]) and done.complete == (len(ticks) == 60)
