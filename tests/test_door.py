@@ -81,7 +81,7 @@ def test_the_examples_of_the_documentation_run(tmp_path: Path, monkeypatch: pyte
         for name, text in texts.items()
         if ">>> " in text
     }
-    assert set(codes) == {"replay", "refine", "solve"}
+    assert set(codes) == {"replay", "refine", "solve", "RunLog"}
     _, block = (flowrec.__doc__ or "").split("\n\n    import flowrec\n")
     codes["flowrec"] = textwrap.dedent(block.rpartition("\n\n")[0])
     for code in codes.values():

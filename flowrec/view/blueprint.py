@@ -209,7 +209,8 @@ class _Views:
 
 
 def _single(v: _Views) -> Shown:
-    name = "Robot (orange), route (cyan), flow" if v.tells_flow else "Robot (orange)"
+    tracers = ", tracers (purple)" if e.TRACERS in v.present else ""
+    name = f"Robot (orange), route (cyan){tracers}, flow" if v.tells_flow else f"Robot (orange){tracers}"
     camera = v.camera(name, ["$origin/**"], entity_path("", "camera"))
     maps = (
         v.pair({"assumed": v.map("Assumed flow", e.ASSUMED), "refined": v.map("Refined flow", e.REFINED)}),

@@ -20,9 +20,11 @@ _NAME_LIMIT = 100  # letters of a name
 class RunLog:
     """Values beside a run, from any thread of the program that records: they are recorded, and replayed, as inputs.
 
-    >>> run = RunLog()
-    >>> threading.Thread(target=pump, args=(run,), daemon=True).start()  # which calls run.log
-    >>> flowrec.record("lab.toml", realtime=True, log=run)
+    The run that `flowrec.record(..., realtime=True, log=run)` records takes them.
+
+    >>> import time
+    >>> run = flowrec.RunLog()
+    >>> run.log("pump/pressure", time.monotonic_ns(), 2.1e4, "Pa")
     """
 
     def __init__(self) -> None:

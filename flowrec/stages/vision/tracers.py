@@ -24,7 +24,9 @@ from flowrec.stages.vision.walls import Walls, walls_in_view
 _RADIUS_SHARE = 0.25  # of the robot's radius, for tracers whose radius is not stated
 _STD_PX = 0.15  # of a spot's place, per component
 _SPEED_SHARE = 0.5  # of the robot's top speed: standard deviation of the velocity of a new body, per component
-_ACCELERATION_PER_S = 2.0  # of that top speed: white acceleration over a second
+# Of that top speed: white acceleration over a second. In a bend of radius R it is v^2 / R for a time R / v: at three
+# quarters of the top speed and ten radii of the robot, half. Four times as much follows spots of others.
+_ACCELERATION_PER_S = 0.5
 _GATE = 16.0  # largest d^2 / S: four standard deviations
 _NEAR_ROBOT_RADII = 2.4  # a spot that is nearer to the robot is a part of its image, or of a ring around it
 _EDGE_RADII = 6.0  # from an opening or the edge of the image, and as far as the flow goes in a frame: it came in there
