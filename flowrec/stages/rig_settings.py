@@ -177,7 +177,7 @@ class Lab:
     """The devices of the rig `lab`. Image size, depth, rate and exposure are in [camera]."""
 
     camera: Annotated[str, CAMERAS] = "genicam"
-    device: str = ""  # which camera: serial number, model, address or name; '': the only one there is
+    device: str = ""  # serial number, model, address or name of the camera; '': the only one there is
     device_config: str = ""  # configuration file of the camera, where the driver needs one
     # column of the sensor at which the image begins; None: the image is in the middle of the sensor
     offset_x_px: Annotated[int, Range(0, 65_535)] | None = None

@@ -33,19 +33,18 @@ PUMP_TOPIC = Topic(PUMP, Source.STAGE, 1e-6, type=PumpShare)
 class StreamSettings:
     """A stream of samples that another program or device sends. They are recorded, and replayed as inputs."""
 
-    kind: Annotated[str, STREAM_KINDS] = "lsl"
+    kind: Annotated[str, STREAM_KINDS] = "lsl"  # source of the samples; flowrec methods streams tells what each is
     outlet: str = ""  # name of the outlet; '': that of this section
-    # which outlet, where the name is not enough: an XPath predicate such as "type='Pump' and hostname='bench'"
+    # predicate in XPath that tells the outlet from others of its name, such as "type='Pump'"
     query: str = ""
     channels: tuple[str, ...] = ()  # names of the channels, in order; (): as the stream states them
     unit: str = ""  # unit of all channels; '': as the stream states them
     # Time without a sample after which the stream is silent. None: three periods of its rate, but at least 1 s
     silence_s: Annotated[float, Range(0.01, 1e5)] | None = None
-    # when the stream is silent: note an event, also hold the robot until it is back, or also end the run
+    # answer to a stream that is silent: note an event, also hold the robot until it is back, or also end the run
     on_silence: Literal["note", "hold", "stop"] = "note"
     # time in which the stream has to be found before the run; with on_silence = note the run begins without it
     wait_s: Annotated[float, Range(0.1, 600.0)] = 5.0
-    queue_samples: Annotated[int, Range(1, 10_000_000)] = (
-        100_000  # that may wait for the loop; the oldest are lost first
-    )
+    # largest number of samples that may wait for the loop; beyond it the oldest are lost
+    queue_samples: Annotated[int, Range(1, 10_000_000)] = 100_000
     device: dict[str, Any] = field(default_factory=dict)  # settings of a kind of another package

@@ -32,7 +32,8 @@ def test_the_meaning_of_a_setting_is_the_comment_at_its_own_declaration() -> Non
 
 
 def test_a_meaning_stands_alone_without_the_name_of_the_setting_or_its_neighbour() -> None:
-    leans_on_another = re.compile(r"(of|or|and|in|at|by|for|from|to|kept|likewise|the same|not set)\b", re.IGNORECASE)
+    words = "of|or|and|in|at|by|for|from|to|that|which|kept|likewise|the same|not set"
+    leans_on_another = re.compile(rf"({words})\b", re.IGNORECASE)
     assert [row.key for row in ROWS.values() if leans_on_another.match(row.meaning)] == []
 
 

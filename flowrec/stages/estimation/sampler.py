@@ -103,7 +103,7 @@ class Sampler:
     # take them from a filter that knows no map (`Observer.without_map`): a map is no measurement
     without_map: bool = True
     capacity: Annotated[int, Range(1, 100_000)] = 2000  # the oldest are dropped first
-    # which observations a refinement is given: as the filter made them, trimmed as in the paper, or smoothed afterwards
+    # observations that a refinement is given: as the filter made them, trimmed as in the paper, or smoothed afterwards
     method: Annotated[str, SAMPLERS] = "filter"
     trimmed: Trimmed = field(default_factory=Trimmed)
 

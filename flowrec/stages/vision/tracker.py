@@ -133,7 +133,7 @@ class Tracker:
     click_frame: Annotated[int, Range(0, 2**62)] | None = None  # index of the image of click_px; None: the first one
     # the walls of the mask may be off by this many robot radii; ignored where polarity is None
     wall_error_radii: Annotated[float, Range(0.0, 2.0)] = 0.5
-    tracers: bool = False  # all other bodies are followed, too: beads that drift show the flow
+    tracers: bool = False  # tracks of all bodies but the robot: beads that drift show the flow
     tracer: TracerTracker = field(default_factory=TracerTracker)
 
     @property
