@@ -28,7 +28,7 @@ from flowrec.verbs.replay_segments import verify
 from tests.extras import why
 from tests.short_missions import SMALL
 
-pytest.importorskip("pylsl", reason=why("pylsl"))
+pylsl = pytest.importorskip("pylsl", reason=why("pylsl"))
 
 
 @contextmanager
@@ -120,6 +120,26 @@ def test_no_sample_is_lost_and_stamps_are_those_of_this_machine(name: str) -> No
         assert last.channel_names() == ["pump/flow0", "pump/flow1"] and last.units == "ul/min\nul/min"
         assert abs(last.correction_s[0]) < 0.05 and 0.0 < last.age_s[0] < 1.0
         assert (last.lost[0], last.missing[0], last.steps[0], last.state[0]) == (0, 0, 0, HEARD)
+
+
+def test_the_time_correction_is_added_and_one_that_does_not_answer_costs_no_sample(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def correction(_inlet: pylsl.StreamInlet, timeout: float) -> float:
+        """The sender's clock is a quarter of a second ahead, which is told once."""
+        asked.append(timeout)
+        if len(asked) > 1:
+            raise TimeoutError
+        return -0.25
+
+    monkeypatch.setattr(pylsl.StreamInlet, "time_correction", correction)
+    with outlet(name, "--rate", "200"), Listening([], pump=StreamSettings(outlet=name)) as heard:
+        heard.until(lambda: len(asked) > 2)
+        assert (np.diff(heard.values()) == 1.0).all()
+        heard.until(lambda: len(heard.states) > 1)
+        assert heard.states[-1].correction_s[0] == -0.25 and 0.25 < heard.states[-1].age_s[0] < 0.5
 
 
 def test_a_killed_outlet_is_silent_at_once_and_heard_again_when_it_is_restarted(name: str) -> None:

@@ -7,6 +7,7 @@ silently: the reader looks for it again, and refuses two.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import time
@@ -112,11 +113,9 @@ class LslStream:
             values, stamps = self._inlet.pull_chunk(timeout_s, _MOST, min_samples=1, as_numpy=True)
             arrival_ns = time.monotonic_ns()
             if time.monotonic() - self._looked_s > _CORRECTED_S:
-                self._correction_s = self._inlet.time_correction(0.1)
                 self._note_clock()
-        except TimeoutError:  # of the correction: the one before holds
-            self._note_clock()
-            return None
+                with contextlib.suppress(TimeoutError):  # no answer in time: the correction before it holds
+                    self._correction_s = self._inlet.time_correction(0.1)
         except LostError as error:
             raise NoStreamError("its outlet has ended") from error
         if not len(stamps):
