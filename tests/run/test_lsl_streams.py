@@ -127,7 +127,7 @@ def test_the_time_correction_is_added_and_one_that_does_not_answer_costs_no_samp
 ) -> None:
     asked: list[float] = []
 
-    def correction(_inlet: pylsl.StreamInlet, timeout: float) -> float:
+    def correction(_inlet: object, timeout: float) -> float:
         """The sender's clock is a quarter of a second ahead, which is told once."""
         asked.append(timeout)
         if len(asked) > 1:
