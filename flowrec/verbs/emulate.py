@@ -1,6 +1,7 @@
 """`flowrec emulate NAME`: verbs that start devices which this computer does not have."""
 
 import signal
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions
 if TYPE_CHECKING:
     from flowrec.verbs.emulated_lab import EmulatedLab
 
-_END_S = 10.0  # for a recorder that was interrupted
+_SLICE_S = 0.5  # of the wait for Ctrl-C
 
 
 class Flown:
@@ -68,7 +69,7 @@ def lab(
         say(f"in another terminal: flowrec record {made.file}")
         say("Ctrl-C ends the devices")
         while True:
-            made.wait()
+            time.sleep(_SLICE_S)
 
 
 def _fly(made: "EmulatedLab", session: Path, overwrite: bool) -> Flown:
@@ -77,14 +78,15 @@ def _fly(made: "EmulatedLab", session: Path, overwrite: bool) -> Flown:
 
     words = ["record", str(made.file), "--out", str(session), *(["--overwrite"] if overwrite else [])]
     say(f"flowrec {' '.join(words)}")
+    began_s = time.time()
     recorder = start_child("flowrec", *words, stdin=None, stdout=None)
     try:
         status = recorder.wait()
     except KeyboardInterrupt:
         recorder.send_signal(signal.SIGINT)  # in a session of its own, it has not seen Ctrl-C
-        recorder.wait(_END_S)
+        recorder.wait()  # it completes its file, and has its own limits for the rest
         raise
-    if not session.exists():
+    if not session.exists() or session.stat().st_mtime < began_s:  # refused; a file of before stays
         return Flown(None, status)
     from flowrec.store import Session
 

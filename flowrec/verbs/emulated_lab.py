@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,7 +34,6 @@ _SETTINGS: dict[str, Any] = {
 }
 _TIMER_MS = 300  # of the firmware, for the same reason
 _AGAIN_S = 3.0  # without a field: the mission is over
-_SLICE_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -51,11 +49,6 @@ class EmulatedLab:
     file: Path
     camera: str
     port: str
-    _never: threading.Event
-
-    def wait(self) -> None:
-        """Let them run for a moment."""
-        self._never.wait(_SLICE_S)
 
 
 @contextmanager
@@ -95,6 +88,6 @@ def emulated_lab(
             with output.new_file() as part:
                 part.write_text('rig = "lab"\n' + as_toml(("Devices that flowrec emulate lab runs.",), settings))
             try:
-                yield EmulatedLab(file, images.url, board.port, threading.Event())
+                yield EmulatedLab(file, images.url, board.port)
             finally:
                 file.unlink(missing_ok=True)

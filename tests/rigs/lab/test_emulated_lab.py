@@ -243,6 +243,8 @@ def test_a_mission_on_the_emulated_lab_arrives_states_its_latency_and_gives_back
     said = done.stdout + done.stderr
     assert done.returncode in (0, 3), said[-2000:]
     assert "latency, median and (95 %): arrived" in said
+    again = subprocess.run(command, capture_output=True, text=True, timeout=400.0, check=False)
+    assert again.returncode == 2 and "latency" not in again.stdout, "nothing was flown"
     with Session(session) as recorded:
         outcome = recorded.outcome
         assert outcome["outcome"] == "reached"
