@@ -192,6 +192,52 @@ def test_a_stream_that_stops_is_told_and_holds_or_stops_the_run(what: str) -> No
     assert states == [[HEARD]] and SILENT != HEARD
 
 
+def test_a_robot_is_held_until_the_last_stream_for_which_it_is_held_is_back() -> None:
+    streams = {"pump": Scripted([chunk(0, 10)]), "valve": Scripted([chunk(0, 10)])}
+    control = RunControl()
+    settings = dict.fromkeys(streams, StreamSettings(silence_s=0.55, on_silence="hold"))
+    made = {"realtime": True, "make": lambda name, *_args, **_more: streams[name]}
+    joined = StreamInputs(settings, Clock(), control, lambda _text: None, **made)  # type: ignore[arg-type]
+    joined.connect(ExitStack())
+    actions = []
+    for inputs in joined.join(ticks(40)):
+        for name, back_s in (("pump", 2), ("valve", 3)):
+            if inputs.stamp_ns >= back_s * NS_PER_S:
+                streams[name].coming.append(chunk(inputs.stamp_ns // PERIOD_NS, 10))
+        while (event := control.next_event(inputs.stamp_ns, held=False)) is not None:
+            actions.append((event.action, event.text))
+    silent = [(Action.PAUSE, f"stream {name} is silent") for name in streams]
+    assert actions == [*silent, (Action.RESUME, "stream valve is back")]
+
+
+def test_a_sender_that_was_restarted_has_a_clock_of_its_own() -> None:
+    class Restarted(Scripted):
+        polled = False
+
+        def read(self, timeout_s: float) -> Chunk | None:
+            found = super().read(timeout_s)
+            if found is not None and not len(found.times_ns):
+                raise NoStreamError("its outlet has ended")
+            return found
+
+    stepped = [chunk(5 * n, 5, -30 * NS_PER_S) for n in range(10, 20)]
+    ended = replace(chunk(0, 1), times_ns=np.zeros(0, np.int64))
+    stream = Restarted()
+    reader, _ = reader_of(stream)
+    reader.start()
+    stream.coming += [*(chunk(5 * n, 5) for n in range(10)), *stepped, ended]
+    stream.coming += [chunk(5 * n, 5) for n in range(20, 30)]
+    stamps: list[int] = []
+    end_s = time.monotonic() + 10.0
+    while len(stamps) < 150 and time.monotonic() < end_s:
+        stamps += [int(each) for part in reader.take() for each in part.times_ns[part.channel == 0]]
+        time.sleep(0.01)
+    reader.close()
+    counts = reader.counts()
+    assert (len(stamps), counts.restarts, counts.steps) == (150, 1, 1)
+    assert stamps[100:] == (EPOCH_NS + PERIOD_NS * np.arange(100, 150)).tolist()
+
+
 def test_values_of_a_program_are_a_stream_with_a_channel_a_name() -> None:
     run = RunLog()
     run.log("pump/pressure", EPOCH_NS, 1.0, "Pa")  # before the run has begun
