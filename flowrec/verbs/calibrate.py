@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from flowrec.store import existing_session
 from flowrec.verbs.command import add_verb, verb
 from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions
 
@@ -58,7 +59,10 @@ def coils(
 
 @verb()
 def motion(
-    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap), recorded or imported.")],
+    session: Annotated[
+        Path,
+        typer.Argument(metavar="SESSION", callback=existing_session, help="Session (.mcap), recorded or imported."),
+    ],
     coils: Annotated[
         Path | None,
         typer.Option("--coils", metavar="LOG", help="Another log of the coils (CSV, Excel), on any clock."),

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from flowrec.core import UsageError, stopped_in_one_line
-from flowrec.store import session_path
+from flowrec.store import existing_session
 from flowrec.verbs.completion import complete_setting
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ def readable_toml(file: Path | None) -> Path | None:
 
 
 AsConfig = Union[Path, str, "Config", None]
-SessionFile = Annotated[
-    AnySession, typer.Argument(metavar="SESSION", callback=session_path, help="Session (.mcap), or its URL.")
+SessionFile = Annotated[  # refused where there is none, before imports that take longer than all else of a refusal
+    AnySession, typer.Argument(metavar="SESSION", callback=existing_session, help="Session (.mcap), or its URL.")
 ]
 
 _SET = typer.Option(

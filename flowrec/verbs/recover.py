@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flowrec.store import existing_session
 from flowrec.verbs.command import Told, verb
 from flowrec.verbs.options import Asked
 
@@ -28,7 +29,11 @@ def _recover_told(_asked: Asked, saved: "list[Recovered]") -> Told:
 def recover(
     session: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut-off or damaged file, or a run."),
+        typer.Argument(
+            metavar="FILE",
+            callback=existing_session,
+            help="Unfinished (.mcap.partial), cut-off or damaged file, or a run.",
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Session file to make; X.mcap or X_recovered.mcap by default.")

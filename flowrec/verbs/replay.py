@@ -99,10 +99,6 @@ def replay(
     """
     if verify and refly:
         raise MisuseError("--verify only compares; it goes without --refly")
-    if isinstance(session, Path | str):
-        from flowrec.store import existing_session
-
-        existing_session(session)  # before imports that take longer than all else of a refusal
     from flowrec.verbs.replay_change import Change
 
     named = Change(refine, plan, observer, controller, sets or ())

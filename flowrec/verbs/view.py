@@ -69,9 +69,7 @@ def view(
     Long because its parameters are the options of the verb.
     """
     from flowrec.core import PICTURE, Output
-    from flowrec.store import files_behind
-    from flowrec.view import open_viewer
-    from flowrec.view import screenshot as take
+    from flowrec.store import existing_session, files_behind
 
     if live:
         return _watch(session, "serve" if no_open else "spawn", console, (beside, out, screenshot, time, layout))
@@ -83,6 +81,8 @@ def view(
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     if session.suffix == ".rrd":
         _check_recording(session)
+    else:
+        existing_session(session)
     if beside is not None and ".rrd" in (session.suffix, beside.suffix):
         raise UsageError(f"{session} and {beside}: two sessions (.mcap) are shown in one view, not .rrd files")
     if layout is not None:
@@ -93,6 +93,9 @@ def view(
         Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
     if time is not None:
         _check_time(session, time, screenshot)
+    from flowrec.view import open_viewer
+    from flowrec.view import screenshot as take
+
     rrd, told = _recording(session, beside, out, overwrite)
     if screenshot is not None:
         told += [*take(rrd, screenshot, time_s=time, overwrite=overwrite), f"{screenshot} written"]

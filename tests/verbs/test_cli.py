@@ -141,7 +141,10 @@ STAGES = {"numpy", "scipy", "cv2"}
         (("record", "--set", "robot.nosuch=1"), HEAVY | {"flowrec.verbs.mission_run", "flowrec.verbs.preparation"}),
         (("ls", "."), HEAVY | STAGES),
         (("info", "nosuch.mcap"), HEAVY | STAGES),
-        (("replay", "nosuch.mcap", "--verify"), HEAVY),
+        *(
+            ((*words.split(), "nosuch.mcap"), HEAVY | STAGES)
+            for words in ("replay --verify", "view", "export", "report", "recover", "calibrate motion")
+        ),
     ],
 )
 def test_a_verb_imports_no_library_that_it_does_not_need(words: tuple[str, ...], unwanted: set[str]) -> None:
