@@ -36,7 +36,7 @@ class RobotSettings:
     step_out_margin: PositiveShare = 0.9  # fraction of the step-out frequency that is commanded at most
     delay_s: _Delay | None = None  # time from command to motion. None: fits channels and speed
     # Speed that is not in proportion to the frequency: pairs of frequency (Hz) and speed through the fluid (um/s), both
-    # rising, as measured. um_per_rev is then that of the first pair. (): um_per_rev holds at every frequency
+    # rising, as measured. um_per_rev is then that of the first pair. []: um_per_rev holds at every frequency
     speed_at_hz: Annotated[tuple[tuple[float, float], ...], Range(1e-3, 1e6)] = ()
 
     def check(self, where: str) -> None:

@@ -81,8 +81,9 @@ def setting_rows(section: type = Config, prefix: str = "") -> Iterator[SettingRo
         yield SettingRow(key, default, _valid(hint), unit_of(each.name), meaning, read_by)
 
 
-def section_summary(section: type) -> str:
-    """The first sentence of what a section says of itself."""
+def section_summary(hint: Any) -> str:
+    """The first paragraph of what a section, or each of the sections that a person names, says of itself."""
+    section = named_section(hint) or hint
     return _for_people(" ".join((inspect.getdoc(section) or "").split("\n\n")[0].split()))
 
 

@@ -37,7 +37,7 @@ class StreamSettings:
     outlet: str = ""  # name of the outlet; '': that of this section
     # predicate in XPath that tells the outlet from others of its name, such as "type='Pump'"
     query: str = ""
-    channels: tuple[str, ...] = ()  # names of the channels, in order; (): as the stream states them
+    channels: tuple[str, ...] = ()  # names of the channels, in order; []: as the stream states them
     unit: str = ""  # unit of all channels; '': as the stream states them
     # Time without a sample after which the stream is silent. None: three periods of its rate, but at least 1 s
     silence_s: Annotated[float, Range(0.01, 1e5)] | None = None

@@ -23,6 +23,13 @@ def test_every_setting_states_what_it_means_and_what_is_valid() -> None:
     assert [key for key, row in ROWS.items() if not row.facts] == []
 
 
+def test_every_section_states_what_it_is_about() -> None:
+    sections = settings(None)
+    assert isinstance(sections, dict) and len(sections) > 20
+    assert sections["streams"].startswith("A stream of samples that another program")
+    assert [name for name, about in sections.items() if not about or "->" in about] == []
+
+
 def test_the_meaning_of_a_setting_is_the_comment_at_its_own_declaration() -> None:
     assert ROWS["plan.speed_share"].meaning == "ratio to the robot's speed limit; the rest is left to the controller"
     assert ROWS["plan.idle_speed_um_s"].meaning.startswith("swimming at this speed takes as much power")
