@@ -170,6 +170,7 @@ def test_the_stored_rows_are_of_one_commit_without_local_changes_and_of_every_ex
         assert found["fewest"] > 0 and found["most"] - found["fewest"] <= 1, name
 
 
+@pytest.mark.slow("draws every figure of the paper")
 def test_each_figure_is_drawn_of_the_stored_rows():
     rows = read_parquet(STORED)
     for number, name in enumerate(FIGURES):

@@ -28,6 +28,7 @@ def test_frames_are_dated_to_a_fraction_of_a_millisecond_without_a_step_whatever
     assert ours["step_s"] <= 0.011 / FRAMES_PER_S
 
 
+@pytest.mark.slow("dates 36,000 images")
 def test_skew_unit_and_every_fault_are_told():
     assert taken(series("drift", 70.0))[-1].known
     assert 1e6 * (1.0 / taken(series("stalls", 70.0))[-1].rate - 1.0) == pytest.approx(50.0, abs=1.0)

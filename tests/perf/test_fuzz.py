@@ -22,9 +22,9 @@ def test_whatever_is_done_to_a_session_every_verb_reads_or_refuses_it(tmp_path):
     assert len(campaign.kinds) == 8 and campaign.ends["ticks: read"] and campaign.ends["ticks: refused"]
 
 
-def test_a_hundred_corrupted_sessions_are_opened_and_read_or_refused(tmp_path):
+def test_forty_corrupted_sessions_are_opened_and_read_or_refused(tmp_path):
     campaign = Campaign(tmp_path, verbs=("info", "ticks"))
-    assert not [(seed, faults) for seed in range(10_000, 10_100) if (faults := campaign.run(seed))]
+    assert not [(seed, faults) for seed in range(10_000, 10_040) if (faults := campaign.run(seed))]
 
 
 def test_the_campaign_notices_what_may_not_happen(tmp_path, monkeypatch):

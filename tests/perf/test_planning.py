@@ -8,6 +8,7 @@ from flowrec.bench.trips import draw_trip, worlds
 from tests.perf.planning import magnified, measure, show
 
 
+@pytest.mark.slow("solves and plans on a grid twice as fine")
 def test_a_magnified_world_has_the_same_flow_and_the_same_times():
     world, trip = next(
         (world, trip) for world in worlds(128, 3) if (trip := draw_trip(world, np.random.default_rng(0)))

@@ -72,7 +72,11 @@ def test_a_table_sets_the_um_per_revolution_of_slow_turns_and_the_fastest_speed(
 
 @pytest.mark.parametrize(
     "sets",
-    [["coils.mode=roller"], ["coils.mode=helix"], [table_of(TABLE)]],
+    [
+        pytest.param(["coils.mode=roller"], marks=pytest.mark.slow("the mode of most missions")),
+        pytest.param(["coils.mode=helix"], marks=pytest.mark.slow("flies and replays a mission")),
+        [table_of(TABLE)],
+    ],
     ids=["roller", "helix", "table"],
 )
 def test_a_roller_a_helix_and_a_robot_by_a_table_reach_their_goal_and_replay_identically(tmp_path, sets):

@@ -32,7 +32,10 @@ def content(session: Session, from_ns: int, to_ns: int) -> list[tuple[object, ..
     ]
 
 
-@pytest.mark.parametrize(("from_s", "to_s"), [(None, 1.0), (2.0, 3.0), (4.0, None)])
+@pytest.mark.parametrize(
+    ("from_s", "to_s"),
+    [(None, 1.0), (2.0, 3.0), pytest.param(4.0, None, marks=pytest.mark.slow("the longest of three stretches"))],
+)
 def test_a_cut_session_holds_the_ticks_of_its_stretch_and_replays_exactly(
     session: Path, tmp_path: Path, from_s: float | None, to_s: float | None
 ) -> None:

@@ -178,9 +178,7 @@ KINDS = {
 MORE = pytest.mark.slow("kills a run in another way")
 
 
-@pytest.mark.parametrize(
-    "kind", ["live", "parts", *(pytest.param(kind, marks=MORE) for kind in KINDS if kind not in ("live", "parts"))]
-)
+@pytest.mark.parametrize("kind", ["live", *(pytest.param(kind, marks=MORE) for kind in KINDS if kind != "live")])
 def test_of_a_run_that_is_killed_every_tick_that_it_handed_over_is_in_a_complete_session(tmp_path, kind):
     path = tmp_path / "x.mcap"
     run, _ = started(path, *KINDS[kind])

@@ -80,25 +80,28 @@ def same_ticks(one, other):
     )
 
 
-def test_a_real_recording_cut_anywhere_is_replayed_exactly_after_recovery(session, tmp_path):
+@pytest.mark.parametrize(
+    "place", [0.15, "after images", pytest.param(0.97, marks=pytest.mark.slow("replays nearly a whole session"))]
+)
+def test_a_real_recording_cut_anywhere_is_replayed_exactly_after_recovery(session, tmp_path, place):
     frames = SLOTS["/camera/frame"].channel
     size = max(end for _, end, _ in chunks_of(session))  # what follows can be made again
     images_end = [end for _, end, channels in chunks_of(session) if channels == {frames}][5]
-    for number, length in enumerate((int(0.15 * size), images_end, int(0.97 * size))):
-        path = cut(session, length, tmp_path / f"cut{number}.mcap.partial")
-        done = recover(path)
-        assert done.path == tmp_path / f"cut{number}.mcap" and not path.exists()
-        assert not done.complete and (done.lost_bytes > 0 or length == images_end)
-        reader = SessionReader(done.path)
-        assert reader.outcome["outcome"] == "cut" and "lost:" in reader.outcome["note"]
-        assert reader.header == SessionReader(session).header
-        assert reader.outcome["ticks"] == str(done.ticks)
-        replayed = verb.replay_session(done.path, Change(), verify=True)
-        same, lines = replayed.same, replayed.lines()
-        assert same, lines
-        assert replayed.report.ticks == done.ticks > 0
-        assert ("all but the image" in done.lost) == (reader.counts["frame"] > done.ticks)
-        assert length != images_end or reader.counts["frame"] > done.ticks
+    length = images_end if place == "after images" else int(place * size)
+    path = cut(session, length, tmp_path / "cut.mcap.partial")
+    done = recover(path)
+    assert done.path == tmp_path / "cut.mcap" and not path.exists()
+    assert not done.complete and (done.lost_bytes > 0 or length == images_end)
+    reader = SessionReader(done.path)
+    assert reader.outcome["outcome"] == "cut" and "lost:" in reader.outcome["note"]
+    assert reader.header == SessionReader(session).header
+    assert reader.outcome["ticks"] == str(done.ticks)
+    replayed = verb.replay_session(done.path, Change(), verify=True)
+    same, lines = replayed.same, replayed.lines()
+    assert same, lines
+    assert replayed.report.ticks == done.ticks > 0
+    assert ("all but the image" in done.lost) == (reader.counts["frame"] > done.ticks)
+    assert length != images_end or reader.counts["frame"] > done.ticks
 
 
 def test_a_recovered_session_begins_exactly_as_the_original(small, tmp_path):
@@ -300,7 +303,7 @@ def test_a_running_recording_is_not_taken_for_remains_and_a_killed_one_is_saved(
     assert same_ticks(ticks, flown)
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damage_anywhere_leaves_a_readable_session_or_one_line(small, tmp_path, data):
     content = bytearray(small.read_bytes())

@@ -83,7 +83,9 @@ def test_a_chip_that_looks_the_same_mirrored_is_undecided_by_its_image(symmetric
         assert "looks the same mirrored left to right" in said.text
 
 
-@pytest.mark.parametrize(("growth", "refused"), [(0.7, True), (0.9, False), (1.1, False)])
+@pytest.mark.parametrize(
+    ("growth", "refused"), [(0.7, True), (0.9, False), pytest.param(1.1, False, marks=pytest.mark.slow("another size"))]
+)
 def test_a_scale_off_by_more_than_a_fifth_is_contradicted(symmetric, growth, refused):
     true = AS_STATED.about(stated(symmetric), MIDDLE_PX, growth)
     said = orientation_by_image(pictured(symmetric, true), symmetric, stated(symmetric))

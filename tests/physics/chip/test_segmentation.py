@@ -39,6 +39,7 @@ def test_channel_and_openings_are_found_whether_walls_or_fluid_show(look, shown)
         assert abs(o.first - wanted.first) <= 1 and abs(o.last - wanted.last) <= 1
 
 
+@pytest.mark.slow("segments a picture twice more")
 def test_a_point_says_which_side_of_the_walls_is_the_channel():
     image = seen("dark lines")
     row, column = np.argwhere(VESSELS.mask)[500]

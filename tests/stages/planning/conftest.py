@@ -14,4 +14,4 @@ def any_planner(request):
     extra = PLANNERS[request.param].extra
     if extra:
         pytest.importorskip(extra, reason=why(extra))
-    return with_row(Planner(rrt=RrtSettings(iterations=1500)), PLANNERS, request.param)
+    return with_row(Planner(rrt=RrtSettings(iterations=1000)), PLANNERS, request.param)
