@@ -5,9 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from flowrec.store import existing_session
 from flowrec.verbs.command import add_verb, verb
-from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions
+from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions, known_session
 
 TomlOut = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="TOML", help="Write the settings as a section of a configuration.")
@@ -61,7 +60,7 @@ def coils(
 def motion(
     session: Annotated[
         Path,
-        typer.Argument(metavar="SESSION", callback=existing_session, help="Session (.mcap), recorded or imported."),
+        typer.Argument(metavar="SESSION", callback=known_session, help="Session (.mcap), recorded or imported."),
     ],
     coils: Annotated[
         Path | None,

@@ -14,7 +14,6 @@ import typer
 from typer.core import TyperGroup
 
 from flowrec.core import UsageError, stopped_in_one_line
-from flowrec.store import existing_session
 from flowrec.verbs.completion import complete_setting
 
 if TYPE_CHECKING:
@@ -41,9 +40,16 @@ def readable_toml(file: Path | None) -> Path | None:
     return file
 
 
+def known_session(named: Path) -> Path:
+    """Return the path; refuse a session that is not there, before imports that take longer than all else of that."""
+    from flowrec.store import existing_session
+
+    return existing_session(named)
+
+
 AsConfig = Union[Path, str, "Config", None]
-SessionFile = Annotated[  # refused where there is none, before imports that take longer than all else of a refusal
-    AnySession, typer.Argument(metavar="SESSION", callback=existing_session, help="Session (.mcap), or its URL.")
+SessionFile = Annotated[
+    AnySession, typer.Argument(metavar="SESSION", callback=known_session, help="Session (.mcap), or its URL.")
 ]
 
 _SET = typer.Option(

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flowrec.store import existing_session
 from flowrec.verbs.command import Told, verb
-from flowrec.verbs.options import Asked
+from flowrec.verbs.options import Asked, known_session
 
 if TYPE_CHECKING:
     from flowrec.store import Recovered
@@ -31,7 +30,7 @@ def recover(
         Path,
         typer.Argument(
             metavar="FILE",
-            callback=existing_session,
+            callback=known_session,
             help="Unfinished (.mcap.partial), cut-off or damaged file, or a run.",
         ),
     ],
