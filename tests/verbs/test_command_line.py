@@ -60,7 +60,7 @@ def test_the_help_of_replay_and_export_names_every_method_of_every_table() -> No
         (["nosuch"], "nosuch"),
         (["record", "--split", "3"], "as in --split 2GB,10min"),
         (["record", "--goal", "1,2,3"], "a point is two numbers in um; as in --goal 4400,1500"),
-        (["replay", "a.mcap", "--verify", "--refly"], "--verify only compares"),
+        (["replay", SESSIONS / "golden.mcap", "--verify", "--refly"], "--verify only compares"),
         (["replay", SESSIONS / "golden.mcap", "--verify", "--from", "nan"], "'--from': nan is no number"),
         (["bench", "flow", "--outliers", "inf"], "'--outliers': it must be less than or equal to 1"),
         (["bench", "plan", "--trips", "0"], "'--trips': it must be greater than or equal to 1"),
@@ -82,7 +82,8 @@ def test_the_help_of_every_verb_ends_with_examples_that_can_be_typed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("lab.toml").touch()
+    for name in ("lab.toml", "a.mcap", "a_replay_001.mcap", "a.mcap.partial", "b.mcap", "sweep.parquet"):
+        Path(name).touch()
     group = get_command(app)
     verbs = {name: verb for name, verb in group.commands.items() if name not in ("bench", "calibrate", "emulate")}  # type: ignore[attr-defined]
     assert len(verbs) > 15
