@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import Floats, FlowField, Ints, Observations, cells_at
+from flowrec.core import STD_PER_MAD, Floats, FlowField, Ints, Observations, cells_at
 from flowrec.physics import Chip, clearance_um, sample
 
 EVEN = (1.0, float(np.sqrt(0.2)))  # mean and standard deviation of c of tracers in view at first
@@ -78,7 +78,7 @@ def _profile_share(beads: Observations, assumed: FlowField) -> float:
         return 1.0
     ratio = along[flows] / power[flows]
     middle = float(np.median(ratio))
-    scatter = 1.4826 * float(np.median(np.abs(ratio - middle))) / max(abs(middle), 1e-9)
+    scatter = STD_PER_MAD * float(np.median(np.abs(ratio - middle))) / max(abs(middle), 1e-9)
     came_in = float(np.bincount(index, beads.entered)[flows].astype(bool).mean())
     plates = came_in * (ENTERED[1] / ENTERED[0]) ** 2 + (1.0 - came_in) * EVEN[1] ** 2
     return float(np.clip(scatter**2 / plates, 0.0, 1.0))
