@@ -1,11 +1,11 @@
 """Frame to Tracers: the tracks of all bodies in view but the robot.
 
 Each body is the state of a constant-velocity filter whose acceleration is white noise (Bar-Shalom, Li and Kirubarajan
-2001, section 6.2). One assignment over all bodies decides which spot is which body: it minimises the sum of
-d^2 / S + 2 ln S, the negative log-likelihood of a spot at a distance d from where a body is expected with the variance
-S per component, where a body that is not seen costs the limit of the gate. Pairs beyond the gate are not formed, and
-the pairs fall into groups without a common body or spot, which are assigned one by one: the cost is linear in the
-number of bodies as long as few of them are near each other.
+2001, section 6.2), and which walks at random as a sphere of its radius does in the fluid. One assignment over all
+bodies decides which spot is which body: it minimises the sum of d^2 / S + 2 ln S, the negative log-likelihood of a spot
+at a distance d from where a body is expected with the variance S per component, where a body that is not seen costs the
+limit of the gate. Pairs beyond the gate are not formed, and the pairs fall into groups without a common body or spot,
+which are assigned one by one: the cost is linear in the number of bodies as long as few of them are near each other.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ _SPEED_SHARE = 0.5  # of the robot's top speed: standard deviation of the veloci
 # Of that top speed: white acceleration over a second. In a bend of radius R it is v^2 / R for a time R / v: at three
 # quarters of the top speed and ten radii of the robot, half. Four times as much follows spots of others.
 _ACCELERATION_PER_S = 0.5
+_DIFFUSION_UM3_MPA = (
+    0.218  # k T / (6 pi) at 25 °C: over viscosity and radius it is a diffusion constant (Einstein 1905)
+)
 _GATE = 16.0  # largest d^2 / S: four standard deviations
 _NEAR_ROBOT_RADII = 2.4  # a spot that is nearer to the robot is a part of its image, or of a ring around it
 _EDGE_RADII = 6.0  # from an opening or the edge of the image, and as far as the flow goes in a frame: it came in there
@@ -98,7 +101,8 @@ class TracerTracker:
         if previous is not None:
             next_id = previous.next_id
             dt = seconds(frame.stamp_ns - previous.stamp_ns)
-            bodies = _predict(previous, dt, robot)
+            radius_um = self.search(1.0, robot).radius_px
+            bodies = _predict(previous, dt, robot, _DIFFUSION_UM3_MPA / (chip.viscosity_mpa_s * radius_um))
         rows, columns = assign(bodies.position_um, bodies.std_um**2 + std_um**2, spots_um)
         bodies = self._next_stretch(_correct(bodies, rows, spots_um[columns], std_um), robot, now_s)
         kept = bodies.lost_frames * dt <= self.keep_s
@@ -165,13 +169,14 @@ def assign(expected: Floats, variance: Floats, spots: Floats) -> tuple[NDArray[n
     return both[0], both[1]
 
 
-def _predict(previous: Tracers, dt: float, robot: Robot) -> _Bodies:
-    """The bodies a time later, not seen."""
+def _predict(previous: Tracers, dt: float, robot: Robot, diffusion_um2_s: float) -> _Bodies:
+    """The bodies a time later, not seen; Brownian motion moves them beside their velocity."""
     p = previous
     jerk = (_ACCELERATION_PER_S * robot.max_speed_um_s) ** 2  # um2/s4 over a second: per s
     position, velocity = p.std_um**2, p.velocity_std_um_s**2
     shared = p.shared_um2_s + dt * velocity + jerk * dt**2 / 2.0
     position = position + 2.0 * dt * p.shared_um2_s + dt**2 * velocity + jerk * dt**3 / 3.0
+    position += 2.0 * diffusion_um2_s * dt
     return _Bodies(
         p.id,
         p.position_um + dt * p.velocity_um_s,

@@ -64,6 +64,20 @@ def test_bodies_keep_their_numbers_through_crossings_and_are_placed_within_their
         assert max(np.abs(places[name] / UM - ways[k][n]).max() for n, name in names.items()) < 0.3
 
 
+def test_small_bodies_that_walk_at_random_keep_their_numbers() -> None:
+    um_per_px, radius_um = 0.35, 0.5
+    walk_px = np.sqrt(2.0 * 0.437 / RATE_HZ) / um_per_px  # of a sphere of 1 um in water at 25 degrees
+    rng = np.random.default_rng(3)
+    start = np.stack(np.meshgrid(np.arange(15.0, 150.0, 20.0), np.arange(35.0, 95.0, 20.0)), -1).reshape(-1, 2)
+    ways = start + np.cumsum(rng.normal(0.0, walk_px, (60, len(start), 2)), axis=0)
+    chip, slow = replace(CHIP, um_per_px=um_per_px), replace(ROBOT, radius_um=2.0, max_speed_um_s=10.0)
+    last = None
+    for index, places in enumerate(ways):
+        seen = frame(places, index)
+        last = TracerTracker(radius_um=radius_um).follow(last, None, seen, chip, Calibration(um_per_px), slow)
+    assert last is not None and last.next_id == len(start) == len(last.id)
+
+
 def test_a_body_that_comes_in_at_the_edge_has_entered_and_one_that_was_there_has_not() -> None:
     ways = straight(
         np.array([[80.0, 60.0], [-20.0, 50.0], [100.0, 80.0]]), np.array([[0.5, 0.0], [3.0, 0.0], [0, 0]]), 24
