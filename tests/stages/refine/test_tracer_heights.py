@@ -50,6 +50,23 @@ def test_the_mean_over_beads_is_the_flow(entered: bool, mean: float) -> None:
     assert np.std(ratios) / np.mean(ratios) == pytest.approx(spread, rel=0.15)
 
 
+@pytest.mark.parametrize("entered", [False, True])
+@pytest.mark.parametrize("flat", [False, True])
+def test_where_no_depth_is_stated_the_scatter_of_the_tracers_tells_how_flat_the_profile_is(
+    entered: bool, flat: bool
+) -> None:
+    chip = replace(DUCT, depth_um=None)
+    ratios = []
+    for seed in range(12):
+        beads = of_beads(60, seed, each=1, entered=entered)
+        if flat:
+            beads = replace(beads, flow_um_s=1.4 * sample(ASSUMED, beads.position_um))
+        found = at_mean_height(beads, ASSUMED, chip)
+        there = sample(ASSUMED, found.position_um)
+        ratios += ((found.flow_um_s * there).sum(axis=1) / (there**2).sum(axis=1)).tolist()
+    assert np.mean(ratios) == pytest.approx(1.4, rel=0.05)
+
+
 def test_what_the_robot_observed_is_left_as_it_is_and_few_of_each_tracer_are_used() -> None:
     beads = of_beads(200, 1, each=10)
     own = beads.only(slice(0, 7))
