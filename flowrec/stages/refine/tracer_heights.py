@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import STD_PER_MAD, Floats, FlowField, Ints, Observations, cells_at
+from flowrec.core import Floats, FlowField, Ints, Observations, cells_at
 from flowrec.physics import Chip, clearance_um, sample
 
 EVEN = (1.0, float(np.sqrt(0.2)))  # mean and standard deviation of c of tracers in view at first
@@ -25,6 +25,7 @@ MOST_EACH = 6  # observations of one tracer: more tell no more of the flow than 
 VARIES_SHARE = 0.1
 # Pixels of the mask from a wall: nearer to it than walls may be off, a predicted speed says nothing of a tracer's.
 LEAST_PX = 2.0
+_HEIGHTS = 400  # of half a channel, by which quantiles of c are known to 0.5 %
 MOST = 100  # of all tracers, the latest first: the time of a refinement grows with the square
 
 
@@ -65,8 +66,8 @@ def _few_of_each(tracer: Floats) -> Ints:
 def _profile_share(beads: Observations, assumed: FlowField) -> float:
     """Part of the variance of c between plates that the tracers show, from 0 for a flat profile to 1.
 
-    By the ratio of each tracer's speed to the assumed one there, and its median absolute deviation from their median:
-    an assumed flow that is wrong by one factor leaves it.
+    By the ratio of each tracer's speed to the assumed one there, and the range of its middle 80 % over its median: an
+    assumed flow that is wrong by one factor leaves it, and so does a tenth of tracers that lie still.
     """
     predicted = sample(assumed, beads.position_um)
     assert beads.tracer is not None and beads.entered is not None
@@ -77,8 +78,16 @@ def _profile_share(beads: Observations, assumed: FlowField) -> float:
     if np.count_nonzero(flows) < 3:
         return 1.0
     ratio = along[flows] / power[flows]
-    middle = float(np.median(ratio))
-    scatter = STD_PER_MAD * float(np.median(np.abs(ratio - middle))) / max(abs(middle), 1e-9)
     came_in = float(np.bincount(index, beads.entered)[flows].astype(bool).mean())
-    plates = came_in * (ENTERED[1] / ENTERED[0]) ** 2 + (1.0 - came_in) * EVEN[1] ** 2
-    return float(np.clip(scatter**2 / plates, 0.0, 1.0))
+    height = (np.arange(_HEIGHTS) + 0.5) / _HEIGHTS
+    plates = 1.5 * (1.0 - height**2)
+    shown = _scatter(ratio, np.ones(len(ratio))) / _scatter(plates, 1.0 - came_in + came_in * plates)
+    return float(np.clip(shown**2, 0.0, 1.0))
+
+
+def _scatter(values: Floats, weight: Floats) -> float:
+    """The range of the middle 80 % of weighted values over their median."""
+    order = np.argsort(values)
+    below = np.cumsum(weight[order])
+    low, middle, high = values[order][np.searchsorted(below, np.array([0.1, 0.5, 0.9]) * below[-1])]
+    return float(high - low) / max(abs(float(middle)), 1e-9)
