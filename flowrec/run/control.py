@@ -20,7 +20,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from flowrec.core import NS_PER_S, Action, Coverage, OperatorEvent, UsageError
+from flowrec.core import BY_STREAM, NS_PER_S, Action, Coverage, OperatorEvent, UsageError
 
 Result = TypeVar("Result")
 
@@ -71,6 +71,7 @@ class RunControl:
             action: deque(maxlen=1) for action in (Action.GOAL, Action.SPEED)
         }
         self._steered_ns = -_STEERING_NS
+        self._held_by_stream = False  # and by no person
         self._zero_sent = self._at_work = self._looping = False
         self._working = False  # in `unless_stopped`, also on the way out of it
         self._raised_s = math.inf  # time of the last `Interrupted`
@@ -116,7 +117,7 @@ class RunControl:
         return self.request(Action.MARK, str(next(self._marks)))
 
     def toggle_hold(self) -> None:
-        """Hold the robot, or let it go on if it is held."""
+        """Hold the robot, or let it go on if it is held; where a stream alone holds it, hold it, too."""
         self._waiting.append((_HOLD, ""))
 
     def stop(self, reason: str, *, zero: bool = False, status: int = _STOPPED) -> None:
@@ -149,8 +150,13 @@ class RunControl:
         if not self._waiting:
             return self._next_steering(stamp_ns)
         action, text = self._waiting.popleft()
-        if action == _HOLD:
-            action = Action.RESUME if held else Action.PAUSE
+        by_stream = text.startswith(BY_STREAM)
+        if action == _HOLD:  # of a robot that a stream holds, a person keeps it held, whether the stream is back or not
+            action = Action.RESUME if held and not self._held_by_stream else Action.PAUSE
+        if action == Action.RESUME and by_stream and not self._held_by_stream:
+            action = Action.NOTE  # a person holds it, or has let it go
+        if action in (Action.PAUSE, Action.RESUME):
+            self._held_by_stream = action == Action.PAUSE and by_stream and (self._held_by_stream or not held)
         return OperatorEvent(stamp_ns, action, text)
 
     def _next_steering(self, stamp_ns: int) -> OperatorEvent | None:

@@ -210,6 +210,33 @@ def test_a_robot_is_held_until_the_last_stream_for_which_it_is_held_is_back() ->
     assert actions == [*silent, (Action.RESUME, "stream valve is back")]
 
 
+def test_what_a_person_holds_is_not_let_go_by_a_stream_that_is_back() -> None:
+    silent, back = "stream pump is silent", "stream pump is back"
+    control, held, seen = RunControl(), False, []
+
+    def take() -> None:
+        nonlocal held
+        event = control.next_event(NS_PER_S, held)
+        assert event is not None
+        held = {Action.PAUSE: True, Action.RESUME: False}.get(Action(event.action), held)
+        seen.append((event.action, held))
+
+    for person_first in (True, False):
+        for ask in sorted(("person", "stream"), reverse=not person_first):
+            control.toggle_hold() if ask == "person" else control.request(Action.PAUSE, silent)
+            take()
+        control.request(Action.RESUME, back)
+        take()
+        control.toggle_hold()  # the person lets it go
+        take()
+    assert seen == 2 * [(Action.PAUSE, True), (Action.PAUSE, True), (Action.NOTE, True), (Action.RESUME, False)]
+    control.request(Action.PAUSE, silent)
+    take()
+    control.request(Action.RESUME, back)
+    take()
+    assert seen[-2:] == [(Action.PAUSE, True), (Action.RESUME, False)], "held by the stream alone"
+
+
 def test_a_sender_that_was_restarted_has_a_clock_of_its_own() -> None:
     class Restarted(Scripted):
         polled = False

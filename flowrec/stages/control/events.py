@@ -248,13 +248,15 @@ def _hold(last: Tick, tick: Tick) -> Iterator[str]:
         if since_ns is not None and not mission.finished:
             yield f"goes on after {seconds(tick.stamp_ns - since_ns):.1f} s"
         return
+    asked = tick.operator if tick.operator is not last.operator else None
+    by_stream = asked is not None and asked.text.startswith(BY_STREAM)
     if since_ns is None:
         wait = f" (the {mission.wanted.replace('_', ' ')} that it waits for goes on)" if mission.wanted else ""
         no_route = mission.phase == Phase.PLAN and not mission.wanted
-        asked = tick.operator
-        by_stream = asked is not None and asked is not last.operator and asked.text.startswith(BY_STREAM)
         by = f"held: {asked.text}" if asked is not None and by_stream else "held by the operator"
         yield f"held: {mission.note}" if no_route else f"{by}{wait}"
+    elif asked is not None and asked.action == Action.PAUSE and not by_stream:
+        yield "held by the operator, too"
     if before is not None and mission.swept != before.swept:
         off = f" by {demand.error_um:.0f} um" if demand is not None else ""
         why = ": the flow is faster than the robot" if demand is not None and demand.saturated else ""
