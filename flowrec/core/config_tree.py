@@ -168,6 +168,9 @@ def type_error(root: type, key: str, value: Any, complaint: str) -> str:
     names, valid = _names_of(hint), range_of(hint)
     if names:
         return f"{key} = {value!r}: must be one of {', '.join(names)}{nearest_of(value, names)}"
+    if _is_list(hint):
+        wanted = "a list is wanted" if valid is None else f"a list is wanted, of numbers {valid}"
+        return f"{key} = {value!r}: {wanted} ({complaint.replace('tuple', 'list')})"
     if valid is not None and isinstance(value, (int, float)):
         if value in valid:
             return f"{key} = {value!r}: must be a whole number {valid}; the nearest is {round(value)}"
@@ -175,6 +178,11 @@ def type_error(root: type, key: str, value: Any, complaint: str) -> str:
     if isinstance(value, str) and valid is not None:
         return f"{key} = {value!r}: is no number; one {valid} is wanted, without its unit"
     return f"{key} = {value!r}: {complaint}" + (f"; a number {valid} is wanted" if valid is not None else "")
+
+
+def _is_list(hint: Any) -> bool:
+    """True for a setting that takes several values."""
+    return any(get_origin(part) in (tuple, list) for part in (hint, *get_args(hint)))
 
 
 def _as_declared(root: type, key: str) -> str:

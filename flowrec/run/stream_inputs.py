@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Self
 
 import numpy as np
@@ -95,16 +96,28 @@ class StreamInputs:
         self._stated_ns = -_STATED_NS
         self._stated: tuple[object, ...] = ()
 
-    def connect(self, stack: ExitStack) -> None:
+    def connect(self, stack: ExitStack, read: Mapping[str, str] = MappingProxyType({})) -> None:
         """Find all senders; the stack closes them again.
+
+        Parameters
+        ----------
+        read : channels that a stage reads, STREAM/CHANNEL, by the setting that names them.
 
         Raises
         ------
         RigError : one line; a sender that is not there, or can not be used.
+        UsageError : a sender states its channels, and one that a stage reads is none of them.
         """
         for each in self._known:
             stack.callback(each.reader.close)
             each.reader.connect()
+            there = each.reader.head.channels
+            for setting, channel in read.items():
+                name, _, wanted = channel.partition("/")
+                if name == each.reader.name and there and wanted not in there:
+                    raise UsageError(
+                        f"{setting} = {channel!r}: stream {name} has no such channel, but {', '.join(there)}"
+                    )
         if self._log is not None:
             self._log.attach(self._logged)
             stack.callback(self._log.attach, {})

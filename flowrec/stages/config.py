@@ -330,7 +330,7 @@ def _config_from(
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(part for part in map(str, first["loc"]) if not _OF_PYDANTIC.match(part))
-        if first["type"] == "missing":
+        if first["type"] == "missing" and not key.rpartition(".")[2].isdecimal():
             raise UsageError(f"{origin(key)}: {key} is missing; a session states it") from error
         raise UsageError(f"{origin(key)}: {type_error(kind, key, first['input'], first['msg'].lower())}") from error
     return config

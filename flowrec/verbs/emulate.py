@@ -60,8 +60,11 @@ def lab(
     RigError : nothing can compile the firmware; a device does not start.
     UsageError, OutputError : settings that describe no lab; the file may not be written.
     """
+    from flowrec.core import MCAP, Output
     from flowrec.verbs.emulated_lab import emulated_lab
 
+    if fly is not None:  # before a compilation
+        Output(fly, MCAP, (), overwrite).check()
     with emulated_lab(out, 1e-3 * camera_delay_ms, sets or (), overwrite) as made:
         if fly is not None:
             return _fly(made, fly, overwrite)

@@ -199,7 +199,8 @@ class _Mission:
         if isinstance(rig, Connecting):
             stack.enter_context(rig.connected())
         if self._streams is not None:
-            self._streams.connect(stack)
+            pump = config.pump.channel
+            self._streams.connect(stack, {"pump.channel": pump} if pump else {})
         if isinstance(rig, Picturing) and config.mission.check_axes:
             verdict = checked_image(rig.picture(), config, chip, "camera")
             self._source |= {"source_axes": verdict.text} if verdict is not None else {}

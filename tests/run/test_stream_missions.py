@@ -116,6 +116,13 @@ def test_wrong_settings_of_a_stream_are_refused_in_one_line(sets: list[str], com
     assert "\n" not in str(refused.value)
 
 
+def test_a_channel_that_its_stream_does_not_have_is_refused_before_there_is_a_file(tmp_path: Path) -> None:
+    config = load_config(None, [*SMALL, *PUMP, "pump.channel=pump/pressure"])
+    with pytest.raises(UsageError, match=r"pump\.channel = 'pump/pressure': stream pump has no such channel, but flow"):
+        record(config, tmp_path / "x.mcap", duration_s=0.1)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_streams_of_other_programs_need_real_time(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="samples of other programs come in real time"):
         record(load_config(None, [*SMALL, "streams.pump.kind=log"]), tmp_path / "run.mcap", duration_s=0.1)
