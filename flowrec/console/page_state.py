@@ -56,6 +56,13 @@ class PageState:
         x, y = self._scene.from_plane(self._scene.image_to_plane(self.tick) @ (x_px, y_px, 1.0)).tolist()
         return x, y
 
+    def chip_share(self, x: float, y: float) -> tuple[float, float]:
+        """A share of the speed limit along x and y of the chip, for one along those of the image; of the same length."""
+        across = np.subtract(self.chip_um(x, y), self.chip_um(0.0, 0.0))
+        length = math.hypot(*across)
+        x, y = (across * (math.hypot(x, y) / length if length > 0.0 else 0.0)).tolist()
+        return x, y
+
     def drawing(self) -> Drawing:
         """Content that changes rarely: walls, route, goal; and the sizes."""
         left, top, right, bottom = self._scene.image_bounds()
@@ -83,6 +90,7 @@ class PageState:
             "state": state_text(mission, estimate) or Phase.START.value,
             "waits_for": mission.wanted.replace("_", " ") if mission is not None else "",
             "held": mission is not None and mission.held_since_ns is not None,
+            "by_hand": mission is not None and mission.by_hand,
             "observing": mission is not None and mission.phase == Phase.OBSERVE,
             "robot": None if at is None or not np.isfinite(at).all() else [round(each, 1) for each in at],
             "seen": estimate is not None and estimate.seen,

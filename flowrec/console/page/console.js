@@ -256,6 +256,10 @@ function connect() {
       return;
     }
     const words = JSON.parse(data);
+    if (words.answers === "hand") {
+      handAnswered(words.refusal);
+      return;
+    }
     if ("answers" in words) {
       answered(words.answers, words.refusal);
       return;

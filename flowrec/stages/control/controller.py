@@ -177,6 +177,7 @@ class Controller:
         strength: float = 1.0,
         estimate_uses_map: bool = False,
         driven_um_s: Floats | None = None,
+        hand_share: Floats | None = None,
     ) -> Demand:
         """The demand after this frame, never above the robot's speed limit.
 
@@ -191,6 +192,7 @@ class Controller:
         um_per_px : size of those pixels.
         strength : 0 to 1, present fraction of the field's full amplitude; the step-out frequency is proportional to it.
         estimate_uses_map : the observer corrects the map (kalman_map), so it does not lag behind it.
+        hand_share : (2,) velocity over the speed limit by which a hand steers, in the place of the method; None: none.
         driven_um_s : (2,) velocity to demand without any feedback, as the check of the axes does; None: control it.
 
         Raises
@@ -217,13 +219,22 @@ class Controller:
             dt_s=dt_s,
             um_per_px=um_per_px,
         )
-        reference = self._reference(now, law) if driven_um_s is None else _where_it_is(now)
+        if mission.by_hand:
+            progress_s = previous.progress_s if previous is not None else 0.0
+            reference = Reference.at_rest(now.predicted_um, estimate, progress_s)
+        else:
+            reference = self._reference(now, law) if driven_um_s is None else _where_it_is(now)
         demand, saturated = np.zeros(2), False
-        if driven_um_s is not None:
+        if mission.by_hand and hand_share is None:
+            pass  # the hand has let go: the field is off
+        elif driven_um_s is not None and not mission.by_hand:
             if estimate.seen and not mission.finished:
                 demand, saturated = limit_length(driven_um_s, now.limit_um_s)
         elif not mission.finished and math.isfinite(reference.error_um):
-            demand, saturated = law.velocity(now, reference)
+            if mission.by_hand and hand_share is not None:
+                demand, saturated = limit_length(hand_share * now.limit_um_s, now.limit_um_s)
+            else:
+                demand, saturated = law.velocity(now, reference)
             if clearance_um is not None and self.guard_radii > 0.0:
                 keep_um, per_s = self.guard_radii * robot.radius_um, now.scaled_rate(self.guard_per_s)
                 demand, limited = wall_barrier(demand, now, clearance_um, keep_um, per_s)
