@@ -152,11 +152,11 @@ class _Commands:
             self._steering[page] = now_s
         return soon
 
-    def gone(self, page: str) -> None:
-        """A page is gone: its hand steers no longer."""
+    def gone(self, page: str, why: str = "the page was closed") -> None:
+        """The hand of a page steers no longer, and nobody waits to hear what the run makes of it."""
         if page in self._steering:
             with suppress(OSError):  # the run has ended
-                self._answer({**self._let_go(page, "the page was closed"), "ticket": 0})
+                self._answer({**self._let_go(page, why), "ticket": 0})
 
     def _let_go(self, page: str, why: str) -> dict[str, Any]:
         self._steering.pop(page, None)
@@ -166,7 +166,11 @@ class _Commands:
         """A sample of a hand, or that it has let go; what it asks for on the image, on the chip."""
         if asked["held"] is not True:
             return self._let_go(page, str(asked["why"]))
-        x, y = self._board.page_state.chip_share(*_finite(asked["x"], asked["y"]))
+        try:
+            x, y = self._board.page_state.chip_share(*_finite(asked["x"], asked["y"]))
+        except ValueError:
+            self.gone(page, "a sample that is no number")
+            raise
         press, by = int(asked["press"]), str(asked["by"])
         return {"command": HAND, "page": page, "held": True, "press": press, "x": x, "y": y, "by": by}
 

@@ -57,7 +57,7 @@ class PageState:
         return x, y
 
     def chip_share(self, x: float, y: float) -> tuple[float, float]:
-        """A share of the speed limit along x and y of the chip, for one along those of the image; of the same length."""
+        """A share of the speed limit along x and y of the chip, for one of the same length along those of the image."""
         across = np.subtract(self.chip_um(x, y), self.chip_um(0.0, 0.0))
         length = math.hypot(*across)
         x, y = (across * (math.hypot(x, y) / length if length > 0.0 else 0.0)).tolist()
@@ -85,16 +85,16 @@ class PageState:
         field = tick.currents
         at = None if estimate is None else (self._scene.to_plane(estimate.position_um) + shift_px(tick.shift)).tolist()
         error_um = tick.demand.error_um if tick.demand is not None else math.nan
+        by_hand = mission is not None and mission.by_hand
         return {
             "time_s": round(seconds(max(tick.stamp_ns, 0)), 2),
             "state": state_text(mission, estimate) or Phase.START.value,
             "waits_for": mission.wanted.replace("_", " ") if mission is not None else "",
             "held": mission is not None and mission.held_since_ns is not None,
-            "by_hand": mission is not None and mission.by_hand,
             "observing": mission is not None and mission.phase == Phase.OBSERVE,
             "robot": None if at is None or not np.isfinite(at).all() else [round(each, 1) for each in at],
             "seen": estimate is not None and estimate.seen,
-            "error_um": round(error_um) if math.isfinite(error_um) else None,
+            "error_um": round(error_um) if math.isfinite(error_um) and not by_hand else None,
             "field": "off"
             if field is None or field.amplitude_mt == 0.0
             else f"{field.amplitude_mt:.1f} mT, {field.frequency_hz:.1f} Hz",

@@ -1,8 +1,8 @@
 """Steering by hand: a person's samples of direction and speed, while a dead-man's button is held.
 
-Samples come from the pages of consoles, in their threads; the loop takes the latest one at each tick. Steering ends when
-the button is released, the page is closed, or no sample has come for `SILENCE_S`. Then the field is taken away at once,
-before any tick (`Watchdog.rest`), and the next tick records why. What has ended goes on with another press of the
+Samples come from the pages of consoles, in their threads; the loop takes the latest one at each tick. Steering ends
+when the button is released, the page is closed, or no sample has come for `SILENCE_S`. Then the field is taken away at
+once, before any tick (`Watchdog.rest`), and the next tick records why. What has ended goes on with another press of the
 button only, so a page that was frozen does not steer again by itself. One page steers at a time.
 """
 

@@ -92,7 +92,8 @@ def obey(control: RunControl, words: dict[str, Any]) -> str:
 
     Parameters
     ----------
-    words : `command`, and of a hand what `_steer` takes, `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), or `text`.
+    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), of a hand what
+        `_steer` takes, else `text`.
     """
     try:
         name = words["command"]

@@ -83,7 +83,7 @@ document.addEventListener("keydown", (event) => {
     return;
   }
   if (event.key === " " && event.target instanceof HTMLButtonElement) return; // presses that button
-  const row = facts.commands.find((each) => each.key === event.key);
+  const row = facts.commands.find((each) => each.key === event.key.toLowerCase());
   if (row !== undefined) {
     event.preventDefault();
     press(row);
