@@ -335,17 +335,18 @@ def test_a_hand_steers_where_the_image_shows_and_lets_go_when_its_page_is_closed
     ],
 )
 def test_steering_ends_by_release_by_nonsense_and_by_silence(scene: Scene, sent: str, why: str) -> None:
-    with (served := Served(scene)).console, served.page() as page:
-        with served.control.hand.connected(lambda: None, lambda: None):
-            page.send(sample())
-            until(lambda: served.control.hand.check() is not None)
-            if sent:
-                time.sleep(0.01)
-                page.send(sent)
-            assert why_ended(served.control) == why
-            page.send(sample())
-            refused = [words["refusal"] for words in itertools.islice(answers_to(page), 3 if sent else 2)]
-            assert "let go of the button" in refused[-1], refused
+    served = Served(scene)
+    hand = served.control.hand
+    with served.console, served.page() as page, hand.connected(lambda: None, lambda: None):
+        page.send(sample())
+        until(lambda: hand.check() is not None)
+        if sent:
+            time.sleep(0.01)
+            page.send(sent)
+        assert why_ended(served.control) == why
+        page.send(sample())
+        refused = [words["refusal"] for words in itertools.islice(answers_to(page), 3 if sent else 2)]
+        assert "let go of the button" in refused[-1], refused
 
 
 REFUSED = {

@@ -189,17 +189,9 @@ def main() -> None:
         rows = []
         for name, times in found.items():
             ms = np.array([each for each in times if each is not None])
-            rows.append(
-                [
-                    name,
-                    str(len(times)),
-                    str(len(ms)),
-                    *(f"{f(ms):.1f}" if len(ms) else "-" for f in (np.median, np.max)),
-                ]
-            )
-        table(
-            "From a hand that lets go to no current", ["ending", "trials", "measured", "median, ms", "worst, ms"], rows
-        )
+            figures = [f"{figure(ms):.1f}" if len(ms) else "-" for figure in (np.median, np.max)]
+            rows.append([name, f"{len(ms)} of {len(times)}", *figures])
+        table("From a hand that lets go to no current", ["ending", "measured", "median, ms", "worst, ms"], rows)
         ticks = list(SessionReader(out).ticks(with_frames=False))
         ages = [1e3 * tick.hand.age_s for tick in ticks if tick.hand is not None and tick.hand.held]
         print(f"age of the samples as used: median {np.median(ages):.1f} ms, worst {max(ages):.1f} ms")
