@@ -74,7 +74,7 @@ def application(board: Board, token: str, port: int, rerun_port: int | None, ans
         except WebSocketDisconnect:
             pass
         finally:
-            commands.gone(name)
+            commands.end_steering(name)
             for task in tasks:
                 task.cancel()
             board.leave()
@@ -152,7 +152,7 @@ class _Commands:
             self._steering[page] = now_s
         return soon
 
-    def gone(self, page: str, why: str = "the page was closed") -> None:
+    def end_steering(self, page: str, why: str = "the page was closed") -> None:
         """The hand of a page steers no longer, and nobody waits to hear what the run makes of it."""
         if page in self._steering:
             with suppress(OSError):  # the run has ended
@@ -169,7 +169,7 @@ class _Commands:
         try:
             x, y = self._board.page_state.chip_share(*_finite(asked["x"], asked["y"]))
         except ValueError:
-            self.gone(page, "a sample that is no number")
+            self.end_steering(page, "a sample that is no number")
             raise
         press, by = int(asked["press"]), str(asked["by"])
         return {"command": HAND, "page": page, "held": True, "press": press, "x": x, "y": y, "by": by}

@@ -29,7 +29,7 @@ _MOST_LETTERS = 100  # of a reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Sample:
+class _HandSample:
     page: str
     press: int
     share: Floats
@@ -48,7 +48,7 @@ class HandSteering:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._changed = threading.Condition()  # no signal handler takes its lock, and nobody holds it for long
-        self._sample: _Sample | None = None
+        self._sample: _HandSample | None = None
         self._ended: Hand | None = None  # that the loop has still to take
         self._over: dict[str, tuple[int, str]] = {}  # by page, the last press that has ended, and why
         self._closed = False
@@ -56,7 +56,7 @@ class HandSteering:
         self._go_on: Callable[[], None] = _nothing
 
     @contextmanager
-    def connected(self, rest: Callable[[], None], go_on: Callable[[], None]) -> Iterator[None]:
+    def connection(self, rest: Callable[[], None], go_on: Callable[[], None]) -> Iterator[None]:
         """Context of a run: `rest` takes the field away, from any thread, and `go_on` ends that, from the loop's."""
         self._rest, self._go_on, self._closed = rest, go_on, False
         threading.Thread(target=self._watch, name="hand", daemon=True).start()
@@ -91,7 +91,7 @@ class HandSteering:
             over, why = self._over.get(page, (-1, ""))
             if press <= over:
                 return f"{why}: let go of the button, then hold it again"
-            self._sample = _Sample(page, press, np.array([x, y]), by, self._clock())
+            self._sample = _HandSample(page, press, np.array([x, y]), by, self._clock())
             if held is None:
                 self._changed.notify_all()
         return ""
@@ -105,7 +105,7 @@ class HandSteering:
     # ---- for the loop
 
     def message(self, stamp_ns: int) -> Hand | None:
-        """What the tick of this stamp uses and records: the sample, the end of steering, or nothing."""
+        """The message of the tick of this stamp: the sample that it uses, or why steering has ended; None: neither."""
         with self._changed:
             self._end_if_silent()
             ended, held = self._ended, self._sample
@@ -136,7 +136,7 @@ class HandSteering:
         if self._sample is not None and self._clock() - self._sample.came_s > SILENCE_S:
             self._end(self._sample, f"no sample for {SILENCE_S:g} s")
 
-    def _end(self, held: _Sample, why: str) -> None:
+    def _end(self, held: _HandSample, why: str) -> None:
         # First the field, then the sample: a tick that still takes the sample does not get its field to the coils.
         self._rest()
         self._sample, self._over[held.page] = None, (held.press, why)

@@ -156,7 +156,7 @@ def run(
             stack.enter_context(each)
             arriving = each.join(arriving)
         if live:
-            stack.enter_context(control.hand.connected(watchdog.rest, watchdog.go_on))
+            stack.enter_context(control.hand.connection(watchdog.rest, watchdog.go_on))
             arriving = checked_images(arriving, pipeline.image_shape, pipeline.image_bits)
             arriving = _and_afterwards(arriving, lambda: tick, paced=paced)
         while True:

@@ -396,6 +396,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         driven_um_s is not None,
         hand_share is not None,
     )
+    if mission.by_hand:
+        driven_um_s = np.zeros(2) if hand_share is None else None
     robot = robot.slowed_to(mission.speed_limit_um_s)
     demand = p.controller.control(
         last.demand,
@@ -409,7 +411,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         _strength(p.coils, last),
         p.observer.uses_map(estimate),
         driven_um_s,
-        hand_share,
+        hand_share if mission.by_hand else None,
     )
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO

@@ -337,7 +337,7 @@ def test_a_hand_steers_where_the_image_shows_and_lets_go_when_its_page_is_closed
 def test_steering_ends_by_release_by_nonsense_and_by_silence(scene: Scene, sent: str, why: str) -> None:
     served = Served(scene)
     hand = served.control.hand
-    with served.console, served.page() as page, hand.connected(lambda: None, lambda: None):
+    with served.console, served.page() as page, hand.connection(lambda: None, lambda: None):
         page.send(sample())
         until(lambda: hand.check() is not None)
         if sent:

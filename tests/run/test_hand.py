@@ -85,7 +85,7 @@ def test_a_tick_takes_the_latest_sample_and_the_end_once() -> None:
 def test_without_samples_steering_ends_in_time_and_goes_on_with_another_press_only() -> None:
     clock, rested = Clock(), list[float]()
     hand = HandSteering(clock)
-    with hand.connected(lambda: rested.append(clock.now_s), lambda: None):
+    with hand.connection(lambda: rested.append(clock.now_s), lambda: None):
         hand.steer("a", 1, 1.0, 0.0, "keys")
         clock.now_s += 0.999 * SILENCE_S
         assert hand.check() is not None
@@ -104,7 +104,7 @@ def test_without_samples_steering_ends_in_time_and_goes_on_with_another_press_on
 
 def test_the_thread_ends_steering_while_no_tick_comes() -> None:
     hand, rested = HandSteering(), list[str]()
-    with hand.connected(lambda: rested.append("rest"), lambda: None):
+    with hand.connection(lambda: rested.append("rest"), lambda: None):
         hand.steer("a", 1, 1.0, 0.0, "keys")
         until(lambda: rested)
 
@@ -149,7 +149,7 @@ def test_numbers_that_are_no_share_of_a_speed_end_steering(x: float, y: float) -
 def test_a_command_of_a_tick_that_had_the_sample_brings_no_field_back(when: str) -> None:
     coils = Coils()
     watchdog, hand = Watchdog(coils), HandSteering(Clock())  # type: ignore[arg-type]
-    with hand.connected(watchdog.rest, watchdog.go_on):
+    with hand.connection(watchdog.rest, watchdog.go_on):
         hand.steer("a", 1, 1.0, 0.0, "keys")
         assert held(hand.message(1)) == (1.0, 0.0)  # and the tick computes
         if when.startswith("before"):

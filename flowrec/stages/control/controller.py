@@ -192,7 +192,8 @@ class Controller:
         um_per_px : size of those pixels.
         strength : 0 to 1, present fraction of the field's full amplitude; the step-out frequency is proportional to it.
         estimate_uses_map : the observer corrects the map (kalman_map), so it does not lag behind it.
-        hand_share : (2,) velocity over the speed limit by which a hand steers, in the place of the method; None: none.
+        hand_share : (2,) velocity over the speed limit by which a hand steers, in the place of the method; None: none
+            does.
         driven_um_s : (2,) velocity to demand without any feedback, as the check of the axes does; None: control it.
 
         Raises
@@ -219,22 +220,13 @@ class Controller:
             dt_s=dt_s,
             um_per_px=um_per_px,
         )
-        if mission.by_hand:
-            progress_s = previous.progress_s if previous is not None else 0.0
-            reference = Reference.at_rest(now.predicted_um, estimate, progress_s)
-        else:
-            reference = self._reference(now, law) if driven_um_s is None else _where_it_is(now)
+        reference = self._reference(now, law, driven=driven_um_s is not None)
         demand, saturated = np.zeros(2), False
-        if mission.by_hand and hand_share is None:
-            pass  # the hand has let go: the field is off
-        elif driven_um_s is not None and not mission.by_hand:
+        if driven_um_s is not None:
             if estimate.seen and not mission.finished:
                 demand, saturated = limit_length(driven_um_s, now.limit_um_s)
         elif not mission.finished and math.isfinite(reference.error_um):
-            if mission.by_hand and hand_share is not None:
-                demand, saturated = limit_length(hand_share * now.limit_um_s, now.limit_um_s)
-            else:
-                demand, saturated = law.velocity(now, reference)
+            demand, saturated = law.velocity(now, reference) if hand_share is None else _by_hand(now, hand_share)
             if clearance_um is not None and self.guard_radii > 0.0:
                 keep_um, per_s = self.guard_radii * robot.radius_um, now.scaled_rate(self.guard_per_s)
                 demand, limited = wall_barrier(demand, now, clearance_um, keep_um, per_s)
@@ -251,8 +243,12 @@ class Controller:
             sent_um_s=append_demand(sent, demand, dt_s, robot.delay_s),
         )
 
-    def _reference(self, now: Situation, law: TrackingLaw) -> Reference:
-        """On the way along the route, or at rest."""
+    def _reference(self, now: Situation, law: TrackingLaw, *, driven: bool) -> Reference:
+        """On the way along the route, or at rest; of a robot that is driven or taken by hand where it is."""
+        if now.mission.by_hand:  # and afterwards goes on along the route from where it was taken
+            return Reference.at_rest(now.predicted_um, now.estimate, now.previous.progress_s if now.previous else 0.0)
+        if driven:
+            return _where_it_is(now)
         route = now.route
         following = not now.mission.finished and now.mission.phase in _FOLLOWING
         if not following or route is None or not len(route.waypoints_um) or _hold_ns(now.mission) is not None:
@@ -279,6 +275,11 @@ class Controller:
 def _law(settings: Controller) -> TrackingLaw:
     """The method of a controller with the settings that its row names."""
     return CONTROLLERS[settings.method].build(settings)
+
+
+def _by_hand(now: Situation, share: Floats) -> tuple[Floats, bool]:
+    """The velocity that a hand asks for, and whether the limit reduced it."""
+    return limit_length(share * now.limit_um_s, now.limit_um_s)
 
 
 def _where_it_is(now: Situation) -> Reference:
