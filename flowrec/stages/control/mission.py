@@ -156,7 +156,7 @@ class MissionStateMachine:
         )
         if self.observes:
             return self._observe(now)
-        commanded = now.mission if now.mission.finished else self._after_command(now, steered)
+        commanded = now.mission if now.mission.finished else self._after_command(now)
         if steered and not (checking or commanded.finished or commanded.by_hand):
             commanded = replace(now, mission=commanded).taken_in_hand
         if previous is None or commanded.finished:
@@ -229,11 +229,11 @@ class MissionStateMachine:
             return now.finish(Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {IN_VIEW}"))
         return now.order(Phase.OBSERVE, WorkOrder.REFINE)
 
-    def _after_command(self, now: MissionFrame, steered: bool) -> Mission:
+    def _after_command(self, now: MissionFrame) -> Mission:
         """The mission after the operator's command; the mission itself if there is none.
 
         A held mission does not advance, whatever it waits for, and its time limits are suspended. One that a hand has
-        taken goes on by a person's command alone, and not while the hand steers.
+        taken goes on by a person's command alone.
         """
         command, mission = now.command, now.mission
         since_ns = mission.held_since_ns
@@ -249,7 +249,7 @@ class MissionStateMachine:
             return now.with_changes(held_since_ns=now.now_ns)
         if command == Action.RESUME and since_ns is not None:
             assert now.operator is not None
-            if mission.by_hand and (steered or now.operator.text.startswith(BY_STREAM)):
+            if mission.by_hand and now.operator.text.startswith(BY_STREAM):
                 return mission
             held_ns = mission.held_ns + now.now_ns - since_ns
             return now.with_changes(held_since_ns=None, held_ns=held_ns, swept=False, by_hand=False)
