@@ -11,6 +11,7 @@ gets from `navigator.getGamepads` is replaced, and from there on all is real; th
 from __future__ import annotations
 
 import argparse
+import math
 import random
 import shutil
 import signal
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from flowrec.stages.pipeline import assemble
 from flowrec.stages.resolve import resolve
 from flowrec.store.reader import SessionReader
 from flowrec.verbs.session_replay import replay_session
+from tests.conftest import HANG_S
 from tests.twins.coils import Device, device
 from tests.twins.lab import COMMON, PATIENT, words
 
@@ -125,6 +127,7 @@ def measure(driver: Any, url: str, on: Device, trials: dict[str, int], found: di
     """Find times in ms from each ending to no current, by ending; None: the field did not end, or never came."""
     browser = driver.chromium.launch(executable_path=shutil.which("chromium"))
     context = browser.new_context(viewport={"width": 900, "height": 700})
+    context.set_default_timeout(1000.0 * HANG_S)
     for name, count in trials.items():
         press, end, once = ENDINGS[name]
         page = opened(context, url)
@@ -184,8 +187,11 @@ def main() -> None:
         out = Path(folder) / "hand.mcap"
         found: dict[str, list[float | None]] = {}
         # A computer that is all of it, and busy, may end the run: the guardian is quicker than a hand.
-        with sync_playwright() as driver, lab(Path(folder), out) as (url, on, _recorder), suppress(Error):
-            measure(driver, url, on, trials, found)
+        with sync_playwright() as driver, lab(Path(folder), out) as (url, on, _recorder):
+            try:
+                measure(driver, url, on, trials, found)
+            except Error as error:
+                print(error)
         rows = []
         for name, times in found.items():
             ms = np.array([each for each in times if each is not None])
@@ -194,7 +200,9 @@ def main() -> None:
         table("From a hand that lets go to no current", ["ending", "measured", "median, ms", "worst, ms"], rows)
         ticks = list(SessionReader(out).ticks(with_frames=False))
         ages = [1e3 * tick.hand.age_s for tick in ticks if tick.hand is not None and tick.hand.held]
-        print(f"age of the samples as used: median {np.median(ages):.1f} ms, worst {max(ages):.1f} ms")
+        print(
+            f"age of the samples as used: median {np.median(ages):.1f} ms, worst {max(ages, default=math.nan):.1f} ms"
+        )
         print(f"replay: {'identical' if replay_session(out, verify=True).identical else 'DIFFERS'}")
 
 
