@@ -133,7 +133,8 @@ def measure(driver: Any, url: str, on: Device, trials: dict[str, int], found: di
         page = opened(context, url)
         for _ in range(count):
             page = opened(context, url) if page is None else page
-            found.setdefault(name, []).append(trial(page, on, press, end))
+            found.setdefault(name, []).append(off_ms := trial(page, on, press, end))
+            print(f"{name}: {'not measured' if off_ms is None else f'{off_ms:.1f} ms'}", flush=True)
             if once and not page.is_closed():
                 page.close()
             if once:
