@@ -6,6 +6,7 @@ import asyncio
 import html
 import json
 import math
+import secrets
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -22,11 +23,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from flowrec.console.access import Access
 from flowrec.console.board import MOST_PAGES, NOTHING, Board
 from flowrec.console.rerun_viewer import RerunViewer
-from flowrec.run import COMMANDS, GOAL, LONGEST_NOTE, NOTE, SPEED
+from flowrec.run import COMMANDS, GOAL, HAND, LONGEST_NOTE, NOTE, SPEED
 
 _PERIOD_S = 0.1  # from one state to the next of a page
 _FROZEN_S = 30.0  # a page that takes nothing for so long is let go
 _MOST_PER_S = 10  # commands of all pages together, except those that end the run
+_LEAST_SAMPLE_S = 0.005  # from one sample of a hand to the next of a page
 _ALWAYS = frozenset({"stop", "zero"})
 _PAGE = files("flowrec.console") / "page"
 _TYPES = {"css": "text/css", "js": "text/javascript", "html": "text/html"}
@@ -61,16 +63,18 @@ def application(board: Board, token: str, port: int, rerun_port: int | None, ans
         if not board.enter():
             await socket.close(1013, f"{MOST_PAGES} pages are open already: close one")
             return
+        name = secrets.token_hex(8)  # by which the run knows this page, of all consoles
         tasks = {asyncio.create_task(_send(board, socket))}
         try:
             while True:
                 # The answer waits for the run, the next command for nothing.
-                answering = asyncio.create_task(_answer(socket, *commands.take(await socket.receive_text())))
+                answering = asyncio.create_task(_answer(socket, *commands.take(await socket.receive_text(), name)))
                 tasks.add(answering)
                 answering.add_done_callback(tasks.discard)
         except WebSocketDisconnect:
             pass
         finally:
+            commands.end_steering(name)
             for task in tasks:
                 task.cancel()
             board.leave()
@@ -117,8 +121,10 @@ class _Commands:
     def __init__(self, board: Board, answer: Answer) -> None:
         self._board, self._answer = board, answer
         self._given_s: list[float] = []
+        # When pages have sent their last samples of a hand; of those that have not let go since.
+        self._steering: dict[str, float] = {}
 
-    def take(self, text: str) -> tuple[Any, str | Awaitable[str]]:
+    def take(self, text: str, page: str) -> tuple[Any, str | Awaitable[str]]:
         """Hand a message of a page to the run; by which number the page knows it, and why it is not done, '' if it is.
 
         Only the run's own word has to be waited for.
@@ -127,7 +133,9 @@ class _Commands:
         try:
             asked = json.loads(text)
             number = asked.get("number")
-            words = self._words(asked)
+            if asked["command"] == HAND and asked["held"] is True and self._is_too_soon(page):
+                return number, ""
+            words = self._hand(asked, page) if asked["command"] == HAND else self._words(asked)
             ticket, refusal = self._board.ticket()
             self._answer({**words, "ticket": ticket})
         except OSError:
@@ -135,6 +143,36 @@ class _Commands:
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             return number, f"not understood: {error}"
         return number, refusal
+
+    def _is_too_soon(self, page: str) -> bool:
+        """True if the page has sent another sample of a hand a moment ago, as one does whose samples were held up."""
+        now_s = time.monotonic()
+        soon = now_s - self._steering.get(page, -math.inf) < _LEAST_SAMPLE_S
+        if not soon:
+            self._steering[page] = now_s
+        return soon
+
+    def end_steering(self, page: str, why: str = "the page was closed") -> None:
+        """The hand of a page steers no longer, and nobody waits to hear what the run makes of it."""
+        if page in self._steering:
+            with suppress(OSError):  # the run has ended
+                self._answer({**self._let_go(page, why), "ticket": 0})
+
+    def _let_go(self, page: str, why: str) -> dict[str, Any]:
+        self._steering.pop(page, None)
+        return {"command": HAND, "page": page, "held": False, "why": why}
+
+    def _hand(self, asked: dict[str, Any], page: str) -> dict[str, Any]:
+        """A sample of a hand, or that it has let go; what it asks for on the image, on the chip."""
+        if asked["held"] is not True:
+            return self._let_go(page, str(asked["why"]))
+        try:
+            x, y = self._board.page_state.chip_share(*_finite(asked["x"], asked["y"]))
+        except ValueError:
+            self.end_steering(page, "a sample that is no number")
+            raise
+        press, by = int(asked["press"]), str(asked["by"])
+        return {"command": HAND, "page": page, "held": True, "press": press, "x": x, "y": y, "by": by}
 
     def _words(self, asked: dict[str, Any]) -> dict[str, Any]:
         name = asked["command"]

@@ -16,6 +16,7 @@ from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 from flowrec.core import DOUBTS, FlowField, UsageError, Value, completes_mission, verdict_lines
+from flowrec.run import HAND
 from flowrec.view import Feed, FeedSink, Scene, viewer
 
 PACKAGES = ("starlette", "uvicorn", "websockets")  # of the extra `console`
@@ -160,7 +161,7 @@ class Console(FeedSink):
                 else:
                     refusal = self._obey(words)
                     feed.tell(CommandReply(words["ticket"], refusal))
-                    if refusal:
+                    if refusal and words["command"] != HAND:  # that has 50 samples a second
                         self._tell(f"console: {refusal}")
         if feed.closing:
             return

@@ -56,6 +56,13 @@ class PageState:
         x, y = self._scene.from_plane(self._scene.image_to_plane(self.tick) @ (x_px, y_px, 1.0)).tolist()
         return x, y
 
+    def chip_share(self, x: float, y: float) -> tuple[float, float]:
+        """A share of the speed limit along x and y of the chip, for one of the same length along those of the image."""
+        across = np.subtract(self.chip_um(x, y), self.chip_um(0.0, 0.0))
+        length = math.hypot(*across)
+        x, y = (across * (math.hypot(x, y) / length if length > 0.0 else 0.0)).tolist()
+        return x, y
+
     def drawing(self) -> Drawing:
         """Content that changes rarely: walls, route, goal; and the sizes."""
         left, top, right, bottom = self._scene.image_bounds()
@@ -78,6 +85,7 @@ class PageState:
         field = tick.currents
         at = None if estimate is None else (self._scene.to_plane(estimate.position_um) + shift_px(tick.shift)).tolist()
         error_um = tick.demand.error_um if tick.demand is not None else math.nan
+        by_hand = mission is not None and mission.by_hand
         return {
             "time_s": round(seconds(max(tick.stamp_ns, 0)), 2),
             "state": state_text(mission, estimate) or Phase.START.value,
@@ -86,7 +94,7 @@ class PageState:
             "observing": mission is not None and mission.phase == Phase.OBSERVE,
             "robot": None if at is None or not np.isfinite(at).all() else [round(each, 1) for each in at],
             "seen": estimate is not None and estimate.seen,
-            "error_um": round(error_um) if math.isfinite(error_um) else None,
+            "error_um": round(error_um) if math.isfinite(error_um) and not by_hand else None,
             "field": "off"
             if field is None or field.amplitude_mt == 0.0
             else f"{field.amplitude_mt:.1f} mT, {field.frequency_hz:.1f} Hz",

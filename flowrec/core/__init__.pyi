@@ -38,7 +38,7 @@ from .interpolation import (
 from .messages import (
     Appearance as Appearance, Applied as Applied, Measured as Measured, AxesCheck as AxesCheck, Background as Background,
     Currents as Currents, Demand as Demand, Estimate as Estimate, Event as Event, FlowField as FlowField,
-    Frame as Frame, Health as Health, Mission as Mission, Observations as Observations,
+    Frame as Frame, Hand as Hand, Health as Health, Mission as Mission, Observations as Observations,
     BY_STREAM as BY_STREAM, EXPECTED as EXPECTED, HEARD as HEARD, SAMPLES as SAMPLES, SILENT as SILENT, STREAMS as STREAMS,
     PUMP as PUMP, PumpShare as PumpShare, Samples as Samples, StreamStates as StreamStates,
     OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, TracerTruth as TracerTruth,

@@ -25,6 +25,7 @@ from flowrec.core.messages import (
     Event,
     FlowField,
     Frame,
+    Hand,
     Health,
     Measured,
     Mission,
@@ -141,6 +142,7 @@ class Tick:
     tracers: Annotated[Tracers | None, Topic("/tracers/tracks", Source.STAGE, 1e-6)] = None
     tracer_flow: Annotated[Observations | None, Topic("/tracers/observations", Source.STAGE, 1e-6)] = None
     true_tracers: Annotated[TracerTruth | None, Topic("/truth/tracers", Source.SIMULATOR)] = None
+    hand: Annotated[Hand | None, Topic("/operator/hand", Source.OPERATOR)] = None
     extra: Extra = NO_EXTRA  # of the other topics that the run declares (declared_topics.py)
 
     @property

@@ -10,7 +10,7 @@ from .movie.exported import session_of_log as session_of_log, with_exported as w
 from .movie.rig import MovieRig as MovieRig, fitted_to_movie as fitted_to_movie
 from .movie.source import MovieSource as MovieSource, open_source as open_source, sha256_of as sha256_of
 from .rig import (
-    Clocked as Clocked, Connecting as Connecting, Measuring as Measuring, Picturing as Picturing, Rig as Rig, Tried as Tried, checked_images as checked_images,
+    Clocked as Clocked, Connecting as Connecting, Measuring as Measuring, Picturing as Picturing, Resting as Resting, Rig as Rig, Tried as Tried, checked_images as checked_images,
     increasing_stamps as increasing_stamps,
 )
 from .streams.log import LogStream as LogStream, RunLog as RunLog

@@ -70,6 +70,14 @@ class Clocked(Protocol):
 
 
 @runtime_checkable
+class Resting(Protocol):
+    """A rig that takes the field away between two ticks, and gives it back with the next command."""
+
+    def rest(self) -> None:
+        """Take the field away until the next command. Any thread, at any time; returns at once."""
+
+
+@runtime_checkable
 class Measuring(Protocol):
     """A simulated rig, which has sensors of its own."""
 

@@ -21,6 +21,7 @@ from typing import TypeVar
 import numpy as np
 
 from flowrec.core import BY_STREAM, NS_PER_S, Action, Coverage, OperatorEvent, UsageError
+from flowrec.run.hand import HandSteering
 
 Result = TypeVar("Result")
 
@@ -54,6 +55,7 @@ class RunControl:
     reason : why the run must end; empty before.
     stop_status : exit status of a program that judges and was stopped by that (Ctrl-C and a key are the same).
     ticking : whether the loop has begun; before, nothing is driven, and the end need not wait for anything.
+    hand : steering by hand.
     interruptible : context for the loop: inside it an overdue shutdown raises `Interrupted`.
     """
 
@@ -72,6 +74,7 @@ class RunControl:
         }
         self._steered_ns = -_STEERING_NS
         self._held_by_stream = False  # and by no person
+        self.hand = HandSteering(clock)
         self._zero_sent = self._at_work = self._looping = False
         self._working = False  # in `unless_stopped`, also on the way out of it
         self._raised_s = math.inf  # time of the last `Interrupted`

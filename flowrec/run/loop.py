@@ -156,6 +156,7 @@ def run(
             stack.enter_context(each)
             arriving = each.join(arriving)
         if live:
+            stack.enter_context(control.hand.connection(watchdog.rest, watchdog.go_on))
             arriving = checked_images(arriving, pipeline.image_shape, pipeline.image_bits)
             arriving = _and_afterwards(arriving, lambda: tick, paced=paced)
         while True:
@@ -268,6 +269,8 @@ def _with_events(arrived: Inputs, worker: Worker, control: RunControl, last: Tic
     event = control.next_event(arrived.stamp_ns, held) if live and arrived.operator is None else None
     if event is not None:
         new["operator"] = event
+    if live and (hand := control.hand.message(arrived.stamp_ns)) is not None:
+        new["hand"] = hand
     return replace(arrived, **new) if new else arrived
 
 

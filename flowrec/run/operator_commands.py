@@ -14,7 +14,7 @@ from flowrec.run.control import LONGEST_TEXT, RunControl
 
 LONGEST_NOTE = LONGEST_TEXT
 NOTE = "note"  # the command with a text
-GOAL, SPEED = "goal", "speed"  # commands with numbers
+GOAL, SPEED, HAND = "goal", "speed", "hand"  # commands with numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,15 +92,18 @@ def obey(control: RunControl, words: dict[str, Any]) -> str:
 
     Parameters
     ----------
-    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), or `text`.
+    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), of a hand what
+        `_steer` takes, else `text`.
     """
     try:
         name = words["command"]
-        if name in (GOAL, SPEED) and control.reason:
+        if name in (GOAL, SPEED, HAND) and control.reason:
             return f"the run ends: {control.reason}"
         taken: bool | None = True
         if name == GOAL:
             control.set_goal(float(words["x_um"]), float(words["y_um"]))
+        elif name == HAND:
+            return _steer(control, words)
         elif name == SPEED:
             limit = words["limit_um_s"]
             control.limit_speed(None if limit is None else float(limit))
@@ -111,3 +114,12 @@ def obey(control: RunControl, words: dict[str, Any]) -> str:
     except (KeyError, TypeError, ValueError) as error:
         return f"not understood: {error!r}"
     return "too many commands wait for their tick; give it again" if taken is False else ""
+
+
+def _steer(control: RunControl, words: dict[str, Any]) -> str:
+    """Take a sample of a hand: `page`, `press`, `x`, `y` and `by`; or where it is not `held`, `page` and `why`."""
+    page = str(words["page"])
+    if not words["held"]:
+        control.hand.let_go(page, str(words["why"]))
+        return ""
+    return control.hand.steer(page, int(words["press"]), float(words["x"]), float(words["y"]), str(words["by"]))

@@ -17,9 +17,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
 
 from flowrec.core import Currents, Priority, RigError, realtime_priority
-from flowrec.rigs import Rig
+from flowrec.rigs import Resting, Rig
 
 ZERO_PATIENCE_S = 2.0  # time for zero() to succeed, with all its repetitions; then the run fails
 _RETRY_S = 0.02
@@ -70,6 +73,7 @@ class Watchdog:
         # Each flag is one attribute, set before it takes effect: `_latched` before zero(), `_energised` before a field
         # is sent. So a command that is under way when the watchdog trips is followed by a zero() in either order.
         self._energised = self._latched = self._over = self._reported = False
+        self._resting = False  # by `rest`, until the loop has taken that in; set and looked at as `_latched` is
         self._numbers = itertools.count(1)
         self._requested = self._zeroed = 0  # numbers of the last request for zero(), and of the last fulfilled one
         self._wake = threading.Event()
@@ -82,6 +86,8 @@ class Watchdog:
         field = currents.amplitude_mt > 0.0
         if field and self._latched:
             return
+        if field and self._resting:
+            currents, field = _without_field(currents), False
         if field and not self._energised:
             self.ticked_s = self.clock()
             self._energised = True
@@ -90,6 +96,12 @@ class Watchdog:
             self._energised = False
         elif self._latched:
             self.take_away()
+        elif self._resting:
+            self.apply(currents)
+
+    def go_on(self) -> None:
+        """Let the commands from now on pass again: the loop has taken in why the field was to rest."""
+        self._resting = False
 
     def tick_ended(self) -> None:
         """Note that the loop has completed a tick."""
@@ -152,6 +164,15 @@ class Watchdog:
             self._requested = next(self._numbers)
             self._wake.set()
 
+    def rest(self) -> None:
+        """Take the field away, and let none pass until `go_on`; returns at once.
+
+        A rig that is `Resting` does it now, any other one with the next command.
+        """
+        self._resting = True
+        if isinstance(self._rig, Resting):
+            self._rig.rest()
+
     @property
     def off(self) -> bool:
         """True if every request for zero() is fulfilled."""
@@ -211,3 +232,9 @@ class Watchdog:
 
     def _warn(self, text: str) -> None:
         threading.Thread(target=self._alarm, args=(text,), name="alarm", daemon=True).start()
+
+
+def _without_field(currents: Currents) -> Currents:
+    """The command with no field."""
+    nothing = np.zeros_like(currents.currents_a)
+    return replace(currents, frequency_hz=0.0, amplitude_mt=0.0, limit_hz=0.0, currents_a=nothing)

@@ -32,6 +32,7 @@ from flowrec.core import (
     Floats,
     FlowField,
     Frame,
+    Hand,
     Measured,
     Message,
     Observations,
@@ -92,6 +93,7 @@ class Inputs:
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
     losses: CameraLosses | None = None  # of the camera so far, for the record only
     measured: Measured | None = None  # currents of the coils, by an amplifier that measures them; for the record only
+    hand: Hand | None = None  # the sample by which the operator steers on this tick, or why he does no longer
     delays: Delays | None = None  # of the image and of the latest command, for the record only
     extra: Mapping[str, Message] = NO_EXTRA  # new messages of the extra topics of rig and simulator, by path
 
@@ -184,6 +186,12 @@ def _goal_fault(p: Pipeline, inputs: Inputs) -> str:
     if not (0.0 <= x_um <= width_um and 0.0 <= y_um <= height_um):
         return "it is outside the chip"
     return "" if _wall_um(p, event.goal_um) > 0.0 else "it is in a wall"
+
+
+def _hand_share(inputs: Inputs) -> Floats | None:
+    """Velocity (2,) over the speed limit by which a hand steers on this tick; None: none does."""
+    hand = inputs.hand
+    return hand.share if hand is not None and hand.held and hand.stamp_ns == inputs.stamp_ns else None
 
 
 def _place_on_chip(estimate: Estimate, refined: FlowField | None) -> Estimate:
@@ -368,6 +376,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     tracer_flow = collect_stretches(last.tracer_flow, last.tracers, sight.tracers) if p.tracker.tracers else None
     lap("observe")
     axes, driven_um_s = _axes(p, last, tick, track, rolled)
+    hand_share = _hand_share(inputs)
     mission = p.mission.update(
         last.mission,
         track,
@@ -385,7 +394,10 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         _goal_fault(p, inputs),
         axes,
         driven_um_s is not None,
+        hand_share is not None,
     )
+    if mission.by_hand:
+        driven_um_s = np.zeros(2) if hand_share is None else None
     robot = robot.slowed_to(mission.speed_limit_um_s)
     demand = p.controller.control(
         last.demand,
@@ -399,10 +411,11 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         _strength(p.coils, last),
         p.observer.uses_map(estimate),
         driven_um_s,
+        hand_share if mission.by_hand else None,
     )
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO
-    cut = cut or mission.field_off
+    cut = cut or mission.field_off or (mission.by_hand and hand_share is None)
     # Of a robot that leaves its heading, the heading is turned back by as much.
     ordered = demand if turn is None else replace(demand, velocity_um_s=turn.T @ demand.velocity_um_s)
     currents = p.coils.drive(last.currents, ordered, p.response.responding(robot), mission.finished, cut)

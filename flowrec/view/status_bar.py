@@ -149,7 +149,7 @@ def state_text(mission: Mission | None, estimate: Estimate | None, ended: str = 
         if mission.finished:
             words = mission.outcome or "done"
         elif mission.held_since_ns is not None and not ended:
-            words = "held by the operator"
+            words = "taken by hand" if mission.by_hand else "held by the operator"
         elif not ended:
             words = mission.phase
     if doubtful and (ended or (mission is not None and mission.finished)):

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -50,13 +51,20 @@ def browser() -> Iterator[Any]:
         opened.close()
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    words = [word for setting in [*LONG, *CAMERA] for word in ("--set", setting)]
-    command = [sys.executable, "-m", "flowrec", "record", "--realtime", "--console", "--out", str(tmp_path / "a.mcap")]
+@contextmanager
+def recorded(out: Path, *sets: str) -> Iterator[subprocess.Popen[str]]:
+    """A run in real time with a console, while it lasts."""
+    words = [word for setting in sets for word in ("--set", setting)]
+    command = [sys.executable, "-m", "flowrec", "record", "--realtime", "--console", "--out", str(out)]
     with subprocess.Popen([*command, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         yield process
         process.kill()
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    with recorded(tmp_path / "a.mcap", *LONG, *CAMERA) as process:
+        yield process
 
 
 def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
@@ -159,3 +167,84 @@ def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
     np.testing.assert_allclose(goal.goal_um, GOAL_UM, atol=Session(out).calibration.um_per_px)
     done = again.replay_session(out, again.Change(), verify=True)
     assert done.comparison.identical, str(done.comparison.first)
+
+
+# Nothing can press a button of a gamepad in a headless browser: what the page gets from the API is replaced.
+GAMEPAD = """
+window.pad = { connected: true, mapping: "standard", axes: [0, 0], buttons: Array(17).fill({ pressed: false }) };
+navigator.getGamepads = () => [null, window.pad];
+"""
+HELD = "pad.axes = [0, -0.56]; pad.buttons[5] = { pressed: true }"
+
+
+def test_a_robot_is_steered_by_keys_and_gamepad_of_one_page_and_the_recording_replays_the_same(
+    tmp_path: Path, browser: Any
+) -> None:
+    out = tmp_path / "hand.mcap"
+    goal = ("mission.phases=navigate", "mission.wait_at_goal_s=1000", "mission.goal=[3140.0,1220.0]")
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(HANG_MS)
+    with recorded(out, *LONG[:-2], *CAMERA, *goal, "safety.guard_timeout_s=20") as process:
+        assert process.stdout is not None
+        url = next(line for line in process.stdout if line.startswith("console: ")).split()[1]
+
+        def opened() -> Any:
+            page = context.new_page()
+            page.add_init_script(GAMEPAD)
+            page.goto(url)
+            page.locator("#robot[cx]").wait_for()
+            return page
+
+        def event(words: str, count: int = 1) -> None:
+            page.locator("#events li", has_text=words).nth(count - 1).wait_for()
+
+        page, second = opened(), opened()
+        event("mission: navigate")
+        page.keyboard.press("d")  # without the dead-man's button
+        page.keyboard.down("Shift")
+        page.keyboard.down("d")
+        event("steered by hand (keys)")
+        second.evaluate(HELD)
+        second.locator("#alert", has_text="another page steers by hand").wait_for()
+        second.evaluate("pad.buttons[5] = { pressed: false }")
+        page.keyboard.up("Shift")
+        event("the hand has let go")
+        page.locator("#field", has_text="off").wait_for()
+        page.evaluate(HELD)
+        event("steered by hand (gamepad)")
+        page.evaluate("pad.buttons[5] = { pressed: false }")
+        event("the hand has let go", 2)
+        page.keyboard.press("Space")
+        event("goes on after")
+        page.evaluate(HELD)
+        event("steered by hand (gamepad)", 2)
+        page.evaluate("socket.close()")
+        page.locator("#state", has_text="no connection").wait_for()
+        event("the hand has let go", 3)  # and the page, which is connected again, does not steer: the button is held
+        page.wait_for_timeout(300.0)
+        assert "on" not in (page.locator("#hand").get_attribute("class") or "")
+        page.evaluate("pad.buttons[5] = { pressed: false }")
+        page.wait_for_timeout(100.0)
+        page.evaluate(HELD)
+        event("steered by hand (gamepad)", 3)
+        page.close()
+        page = second
+        event("the hand has let go (the page was closed)")
+        page.locator("#stop").click()
+        text, _ = process.communicate(timeout=HANG_S)
+        assert process.returncode == 0, text
+    context.close()
+    ticks = list(SessionReader(out).ticks(with_frames=False))
+    hands = [tick.hand for last, tick in pairwise(ticks) if tick.hand is not None and tick.hand is not last.hand]
+    for tick in ticks:
+        held = tick.hand is not None and tick.hand.held and tick.hand.stamp_ns == tick.stamp_ns
+        assert tick.mission is not None and tick.currents is not None
+        assert held or not tick.mission.by_hand or tick.currents.amplitude_mt == 0.0
+    shares = {each.by: each.share for each in hands if each.held and each.share.any()}
+    # To the right of the image, and by a half upwards: the camera is turned by 90 degrees and mirrored.
+    camera = Session(out).calibration
+    for by, way in (("keys", (1.0, 0.0)), ("gamepad", (0.0, -0.5))):
+        across = camera.to_um(np.array(way)) - camera.to_um(np.zeros(2))
+        share = np.hypot(*way) * across / np.linalg.norm(across)
+        np.testing.assert_allclose(shares[by], share, atol=1e-6)
+    assert again.replay_session(out, again.Change(), verify=True).comparison.identical

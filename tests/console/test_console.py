@@ -287,6 +287,68 @@ def test_a_goal_and_a_limit_reach_the_run_as_numbers(scene: Scene) -> None:
     assert limit.speed_limit_um_s == 120.0
 
 
+def sample(**more: Any) -> str:
+    """A sample of a hand, as a page sends it: at 60 % to the right of the image."""
+    words = {"command": "hand", "number": "hand", "held": True, "x": 0.6, "y": 0.0, "by": "gamepad", "press": 1}
+    return json.dumps({**words, **more})
+
+
+def why_ended(control: RunControl) -> str:
+    """Wait for the end of steering: what the run records of it."""
+    taken: list[Any] = []
+
+    def ended() -> bool:
+        taken.append(control.hand.message(1))
+        return taken[-1] is not None and not taken[-1].held
+
+    until(ended)
+    return str(taken[-1].why)
+
+
+def test_a_hand_steers_where_the_image_shows_and_lets_go_when_its_page_is_closed(scene: Scene) -> None:
+    with (served := Served(scene)).console:
+        hand = served.control.hand
+        with served.page() as page:
+            for _ in range(30):  # more than there may be other commands
+                page.send(sample())
+                time.sleep(0.01)
+            steering = hand.message(1)
+            assert steering is not None and steering.held
+            across = scene.calibration.to_um((1.0, 0.0)) - scene.calibration.to_um((0.0, 0.0))
+            np.testing.assert_allclose(steering.share, 0.6 * across / np.linalg.norm(across), atol=1e-9)
+            with served.page() as other:
+                other.send(sample())
+                page.send(sample())
+                assert next(answers_to(other))["refusal"] == "another page steers by hand"
+            page.send(sample())
+        assert why_ended(served.control) == "the page was closed"
+        assert not any("another page" in line for line in served.told), "50 times a second"
+
+
+@pytest.mark.parametrize(
+    ("sent", "why"),
+    [
+        (sample(held=False, why="the button was released (keys)"), "the button was released (keys)"),
+        (sample(x=float("nan")), "a sample that is no number"),
+        (sample(x=3.0), "a sample with impossible numbers"),
+        ("", "no sample for 0.15 s"),
+    ],
+)
+def test_steering_ends_by_release_by_nonsense_and_by_silence(scene: Scene, sent: str, why: str) -> None:
+    served = Served(scene)
+    hand = served.control.hand
+    with served.console, served.page() as page, hand.connection(lambda: None, lambda: None):
+        page.send(sample())
+        until(lambda: hand.check() is not None)
+        if sent:
+            time.sleep(0.01)
+            page.send(sent)
+        assert why_ended(served.control) == why
+        page.send(sample())
+        refused = [words["refusal"] for words in itertools.islice(answers_to(page), 3 if sent else 2)]
+        assert "let go of the button" in refused[-1], refused
+
+
 REFUSED = {
     "a negative speed": ({"command": "speed", "limit_um_s": -5}, "speed limit -5 um/s"),
     "a speed of no robot": ({"command": "speed", "limit_um_s": 1e300}, "speed limit 1e+300 um/s"),

@@ -19,6 +19,7 @@ from flowrec.core.messages import (
     Appearance,
     AxesCheck,
     Background,
+    Hand,
     Health,
     Measured,
     Observations,
@@ -72,6 +73,7 @@ def every_topic() -> list[Tick]:
     two, places = np.array([1.0, 2.0]), np.array([[10.0, 20.0], [30.0, 40.0]])
     bodies = {
         "measured": Measured(now, np.arange(3.0), np.arange(3.0)),
+        "hand": Hand(now, True, np.array([0.6, -0.8]), 0.01, "gamepad", "released"),
         "tracers": Tracers(now, two, places, places, two, two, two, two, two, two, places, two, 3),
         "tracer_flow": Observations(now, places, places, two, None, two, None, two, two),
         "true_tracers": TracerTruth(now, two, places, places, 0.3 * two, two, two),

@@ -83,7 +83,7 @@ document.addEventListener("keydown", (event) => {
     return;
   }
   if (event.key === " " && event.target instanceof HTMLButtonElement) return; // presses that button
-  const row = facts.commands.find((each) => each.key === event.key);
+  const row = facts.commands.find((each) => each.key === event.key.toLowerCase());
   if (row !== undefined) {
     event.preventDefault();
     press(row);
@@ -256,6 +256,10 @@ function connect() {
       return;
     }
     const words = JSON.parse(data);
+    if (words.answers === "hand") {
+      handAnswered(words.refusal);
+      return;
+    }
     if ("answers" in words) {
       answered(words.answers, words.refusal);
       return;

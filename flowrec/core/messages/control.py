@@ -62,6 +62,11 @@ class Mission(Message):
         "duration of the phase, without holds, after which the robot began to wait at the goal for another one; None: "
         "it does not wait",
     ] = None
+    by_hand: Annotated[
+        bool,
+        "held because it was steered by hand: but for the ticks on which a hand steers the field is off, until the "
+        "operator lets the mission go on",
+    ] = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

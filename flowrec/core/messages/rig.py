@@ -118,6 +118,20 @@ class OperatorEvent(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Hand(Message):
+    """Steering by hand as a tick used it: one a tick while the button is held, and one that says why this has ended."""
+
+    stamp_ns: int
+    held: Annotated[bool, "the button is held: this sample steers the robot on the tick of the stamp, and on no other"]
+    share: Annotated[
+        Vector2, "demanded velocity over the robot's speed limit, x and y of the chip; its length is at most 1"
+    ]
+    age_s: Annotated[float, "time from the arrival of the sample to the tick that used it"]
+    by: Annotated[str, "what steers: gamepad or keys"]
+    why: Annotated[str, "why steering has ended; '' while the button is held"] = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Truth(Message):
     """Ground truth of a simulated rig. Recorded for evaluation; no stage reads it."""
 

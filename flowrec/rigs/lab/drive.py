@@ -39,7 +39,7 @@ _REST = FieldCommand()
 class Drive:
     """Coils of a lab.
 
-    Only `zero` may be called in another thread than the loop's.
+    Only `zero` and `let_go` may be called in another thread than the loop's.
 
     Parameters
     ----------
@@ -81,6 +81,7 @@ class Drive:
         self._stack = ExitStack()
         self._guardian: Guardian | None = None
         self._taken_away = False  # by zero(), in any thread: one attribute, no lock
+        self._let_go = False  # by let_go(), likewise
         self._command = _REST
         self._commanded_s = self._on_until_s = 0.0
         self._read_back = ReadBack(None, 0.0)
@@ -130,9 +131,14 @@ class Drive:
         """
         if self._taken_away:
             return
+        self._let_go = False
         now_s = self._clock()
         self._send(self._limits.admit(currents, time.monotonic_ns()), now_s)
         self._commanded_s = now_s
+
+    def let_go(self) -> None:
+        """Let the next beat take the field away, as `rest` does. Any thread."""
+        self._let_go = True
 
     def rest(self) -> None:
         """Take the field away until the next command: while the camera is gone."""
@@ -146,6 +152,8 @@ class Drive:
         ------
         RigError : see `apply`.
         """
+        if self._let_go:
+            self.rest()
         now_s = self._clock()
         if now_s - self._commanded_s <= self._patience_s or self._command.amplitude_mt == 0.0:
             self._send(self._command, now_s)

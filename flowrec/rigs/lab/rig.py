@@ -138,6 +138,13 @@ class LabRig:
         if self.drive is not None:
             self.drive.zero()
 
+    def rest(self) -> None:
+        """Switch the field off until the next command, by the loop's next beat, which comes at once if it waits."""
+        if self.drive is not None:
+            self.drive.let_go()
+        if (grabber := self._grabber) is not None:
+            grabber.wake()
+
     def picture(self) -> Image:
         grabber = self._grabber
         assert grabber is not None, "the devices are open"

@@ -177,6 +177,7 @@ class Controller:
         strength: float = 1.0,
         estimate_uses_map: bool = False,
         driven_um_s: Floats | None = None,
+        hand_share: Floats | None = None,
     ) -> Demand:
         """The demand after this frame, never above the robot's speed limit.
 
@@ -191,6 +192,8 @@ class Controller:
         um_per_px : size of those pixels.
         strength : 0 to 1, present fraction of the field's full amplitude; the step-out frequency is proportional to it.
         estimate_uses_map : the observer corrects the map (kalman_map), so it does not lag behind it.
+        hand_share : (2,) velocity over the speed limit by which a hand steers, in the place of the method; None: none
+            does.
         driven_um_s : (2,) velocity to demand without any feedback, as the check of the axes does; None: control it.
 
         Raises
@@ -217,13 +220,13 @@ class Controller:
             dt_s=dt_s,
             um_per_px=um_per_px,
         )
-        reference = self._reference(now, law) if driven_um_s is None else _where_it_is(now)
+        reference = self._reference(now, law, driven=driven_um_s is not None)
         demand, saturated = np.zeros(2), False
         if driven_um_s is not None:
             if estimate.seen and not mission.finished:
                 demand, saturated = limit_length(driven_um_s, now.limit_um_s)
         elif not mission.finished and math.isfinite(reference.error_um):
-            demand, saturated = law.velocity(now, reference)
+            demand, saturated = law.velocity(now, reference) if hand_share is None else _by_hand(now, hand_share)
             if clearance_um is not None and self.guard_radii > 0.0:
                 keep_um, per_s = self.guard_radii * robot.radius_um, now.scaled_rate(self.guard_per_s)
                 demand, limited = wall_barrier(demand, now, clearance_um, keep_um, per_s)
@@ -240,8 +243,12 @@ class Controller:
             sent_um_s=append_demand(sent, demand, dt_s, robot.delay_s),
         )
 
-    def _reference(self, now: Situation, law: TrackingLaw) -> Reference:
-        """On the way along the route, or at rest."""
+    def _reference(self, now: Situation, law: TrackingLaw, *, driven: bool) -> Reference:
+        """On the way along the route, or at rest; of a robot that is driven or taken by hand where it is."""
+        if now.mission.by_hand:  # and afterwards goes on along the route from where it was taken
+            return Reference.at_rest(now.predicted_um, now.estimate, now.previous.progress_s if now.previous else 0.0)
+        if driven:
+            return _where_it_is(now)
         route = now.route
         following = not now.mission.finished and now.mission.phase in _FOLLOWING
         if not following or route is None or not len(route.waypoints_um) or _hold_ns(now.mission) is not None:
@@ -268,6 +275,11 @@ class Controller:
 def _law(settings: Controller) -> TrackingLaw:
     """The method of a controller with the settings that its row names."""
     return CONTROLLERS[settings.method].build(settings)
+
+
+def _by_hand(now: Situation, share: Floats) -> tuple[Floats, bool]:
+    """The velocity that a hand asks for, and whether the limit reduced it."""
+    return limit_length(share * now.limit_um_s, now.limit_um_s)
 
 
 def _where_it_is(now: Situation) -> Reference:

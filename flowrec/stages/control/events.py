@@ -50,6 +50,7 @@ def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | 
         *_look(last, tick),
         *_health(last.health, tick.health),
         *_operator(last, tick),
+        *_hand(last, tick),
         *_axes(last, tick),
         *_streams(last, tick),
         *_mission(last, tick),
@@ -165,6 +166,18 @@ def _operator(last: Tick, tick: Tick) -> Iterator[Line]:
         yield f"operator: {_OPERATOR[event.action]}{text}", None
 
 
+def _hand(last: Tick, tick: Tick) -> Iterator[Line]:
+    """A hand that takes the robot, and one that lets it go."""
+    hand, before = tick.hand, last.hand
+    if tick.mission is None or not tick.mission.by_hand or hand is None or hand is before:
+        return
+    steered = before is not None and before.held
+    if hand.held and not steered:
+        yield f"steered by hand ({hand.by})", None
+    elif not hand.held and steered:
+        yield f"the hand has let go ({hand.why}): the field is off, the robot is held", None
+
+
 def _is_refused(before: Mission, mission: Mission) -> bool:
     """True if the mission has gone back to its former goal."""
     asked = len(before.former_goal_um) > len(mission.former_goal_um) and not mission.finished
@@ -254,8 +267,9 @@ def _hold(last: Tick, tick: Tick) -> Iterator[str]:
         wait = f" (the {mission.wanted.replace('_', ' ')} that it waits for goes on)" if mission.wanted else ""
         no_route = mission.phase == Phase.PLAN and not mission.wanted
         by = f"held: {asked.text}" if asked is not None and by_stream else "held by the operator"
-        yield f"held: {mission.note}" if no_route else f"{by}{wait}"
-    elif asked is not None and asked.action == Action.PAUSE and not by_stream:
+        if not mission.by_hand:
+            yield f"held: {mission.note}" if no_route else f"{by}{wait}"
+    elif asked is not None and asked.action == Action.PAUSE and not by_stream and not mission.by_hand:
         yield "held by the operator, too"
     if before is not None and mission.swept != before.swept:
         off = f" by {demand.error_um:.0f} um" if demand is not None else ""

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, get_args
 import numpy as np
 
 from flowrec.core import (
+    BY_STREAM,
     Action,
     Applied,
     AxesCheck,
@@ -136,6 +137,7 @@ class MissionStateMachine:
         goal_fault: str = "",
         axes: AxesCheck | None = None,
         checking: bool = False,
+        steered: bool = False,
     ) -> Mission:
         """The mission after this frame; the previous object itself while nothing changes.
 
@@ -144,7 +146,8 @@ class MissionStateMachine:
 
         `not_found_note` is the tracker's advice for a robot that is not found; `refused`: it can not be found.
         `goal_fault` says why the goal of `operator` can be none: it is in a wall, or outside the chip. `axes` is the
-        check of the axes; while `checking` is under way or due the mission stays at its start.
+        check of the axes; while `checking` is under way or due the mission stays at its start. `steered`: a hand steers
+        the robot on this frame, which then is held, also when the hand has let go, until the operator lets it go on.
         """
         now = MissionFrame(
             self._first(track.stamp_ns, assumed) if previous is None else previous,
@@ -154,6 +157,8 @@ class MissionStateMachine:
         if self.observes:
             return self._observe(now)
         commanded = now.mission if now.mission.finished else self._after_command(now)
+        if steered and not (checking or commanded.finished or commanded.by_hand):
+            commanded = replace(now, mission=commanded).taken_in_hand
         if previous is None or commanded.finished:
             return commanded
         if commanded.speed_limit_um_s is not None:
@@ -170,7 +175,7 @@ class MissionStateMachine:
         if unseen is not mission or mission.blind_since_ns is not None:
             return unseen
         if mission.held_since_ns is not None:
-            return note_swept(now)
+            return mission if mission.by_hand else note_swept(now)
         if checking:
             return mission
         refuted = axes is not None and axes.verdict in (AxesVerdict.CONTRADICTS, AxesVerdict.NO_MOTION)
@@ -227,7 +232,8 @@ class MissionStateMachine:
     def _after_command(self, now: MissionFrame) -> Mission:
         """The mission after the operator's command; the mission itself if there is none.
 
-        A held mission does not advance, whatever it waits for, and its time limits are suspended.
+        A held mission does not advance, whatever it waits for, and its time limits are suspended. One that a hand has
+        taken goes on by a person's command alone.
         """
         command, mission = now.command, now.mission
         since_ns = mission.held_since_ns
@@ -242,7 +248,11 @@ class MissionStateMachine:
         if command == Action.PAUSE and since_ns is None:
             return now.with_changes(held_since_ns=now.now_ns)
         if command == Action.RESUME and since_ns is not None:
-            return now.with_changes(held_since_ns=None, held_ns=mission.held_ns + now.now_ns - since_ns, swept=False)
+            assert now.operator is not None
+            if mission.by_hand and now.operator.text.startswith(BY_STREAM):
+                return mission
+            held_ns = mission.held_ns + now.now_ns - since_ns
+            return now.with_changes(held_since_ns=None, held_ns=held_ns, swept=False, by_hand=False)
         return mission
 
     def _advance(self, now: MissionFrame) -> Mission:

@@ -61,6 +61,13 @@ class MissionFrame:
         return f"{note} {self.not_found_note}" if self.not_found_note else note
 
     @property
+    def taken_in_hand(self) -> Mission:
+        """The mission that a hand steers on this frame: held, until the operator lets it go on."""
+        since_ns = self.mission.held_since_ns
+        since_ns = self.now_ns if since_ns is None else since_ns
+        return self.with_changes(by_hand=True, held_since_ns=since_ns, swept=False)
+
+    @property
     def now_ns(self) -> int:
         return self.track.stamp_ns
 
@@ -144,6 +151,7 @@ class MissionFrame:
             blind_since_ns=None,
             blind="",
             field_off=False,
+            by_hand=False,
         )
 
     def stop(self, outcome: Outcome) -> Mission:

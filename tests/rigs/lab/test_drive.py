@@ -205,6 +205,22 @@ def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
     assert off_ns is not None and on.off_ns(begin_ns, begin) == off_ns
 
 
+def test_a_hand_that_lets_go_has_no_field_after_the_next_beat_until_the_next_command(on: Device) -> None:
+    begin = on.end()
+    with driven(on, 0.4) as (drive, begin_ns, _):
+        drive.let_go()
+        let_go_ns = time.monotonic_ns()
+        for _ in range(20):
+            drive.beat()
+            time.sleep(0.01)
+        off_ns = on.off_ns(begin_ns, begin)
+        assert off_ns is not None, "the outputs are at zero while the loop waits"
+        assert 1e-9 * (off_ns - let_go_ns) < drive._limits.off_s + drive.info.latency_s + SLACK_S
+        again = on.end()
+        commanded(drive)
+        assert on.energised(again)
+
+
 def test_an_ni_output_that_runs_dry_is_counted_and_ends_in_zero(ni: Device) -> None:
     begin = ni.end()
     with driven(ni, 0.4) as (drive, begin_ns, _):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -25,7 +26,7 @@ from flowrec.stages.config import ResolvedConfig, load_config
 from flowrec.stages.pipeline import Sight, assemble, look
 from flowrec.stages.resolve import resolve
 from flowrec.verbs.record import record
-from tests.conftest import until
+from tests.conftest import HANG_S, until
 from tests.extras import why
 from tests.stages.vision import shaky
 from tests.twins.emulator import emulated, showing
@@ -102,6 +103,9 @@ class Noted:
 
     def apply(self, currents: Currents) -> None:
         self.calls.append(f"apply {currents.amplitude_mt:g}")
+
+    def let_go(self) -> None:
+        self.calls.append("let go")
 
     def rest(self) -> None:
         if "rest" not in self.calls:
@@ -331,3 +335,25 @@ def test_a_package_that_is_not_installed_is_named_with_the_command(
     with pytest.raises(UsageError, match=told):
         record(load_config(None, [*MEASURED, *sets]), tmp_path / "never.mcap")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_loop_that_waits_for_an_image_beats_at_once_when_the_field_is_to_rest() -> None:
+    """With a wait as long as no run has: it does not end by itself."""
+
+    class Blind(Paced):
+        def grab(self, timeout_s: float) -> Grabbed | None:
+            time.sleep(min(0.02, timeout_s))
+            return None
+
+    info, coils = CameraInfo("Blind", "1", 64, 48, 8, 50.0), Noted()
+    make = lambda: Grabber(lambda: Blind((60.0, 61.0), info), Wanted(rate_hz=50.0))  # noqa: E731
+    rig = LabRig(make, coils, config_of())  # type: ignore[arg-type]
+    with rig.connected():
+        grabber = rig._grabber
+        assert grabber is not None
+        waited: list[object] = []
+        thread = threading.Thread(target=lambda: waited.append(grabber.next(10.0 * HANG_S)), daemon=True)
+        thread.start()
+        until(lambda: rig.rest() or waited)
+        thread.join()
+        assert waited == [None] and "let go" in coils.calls

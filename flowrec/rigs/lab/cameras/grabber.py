@@ -201,6 +201,11 @@ class Grabber:
             self._reported = last = exact
         return replace(frame, losses=last)
 
+    def wake(self) -> None:
+        """Let `next` return now, if it waits: the loop has something else to do. Any thread."""
+        with self._filled:
+            self._filled.notify_all()
+
     # ---- the thread
 
     def _work(self) -> None:
