@@ -62,7 +62,7 @@ def doctor(
         bool,
         typer.Option(
             "--protocol",
-            help="Measure, in order, what a lab's first day has to show. Makes fields; goes on where it was interrupted.",
+            help="Measure, in order, what a lab's first day has to show. Makes fields; goes on where it was left.",
         ),
     ] = False,
     answers: Annotated[

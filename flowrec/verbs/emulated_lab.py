@@ -97,6 +97,8 @@ def emulated_lab(
             with output.new_file() as part:
                 part.write_text('rig = "lab"\n' + as_toml(("Devices that flowrec emulate lab runs.",), settings))
             try:
-                yield EmulatedLab(file, images.url, board.port, EmulatedInstruments(board.samples, images, resolved.coils))
+                yield EmulatedLab(
+                    file, images.url, board.port, EmulatedInstruments(board.samples, images, resolved.coils)
+                )
             finally:
                 file.unlink(missing_ok=True)

@@ -83,7 +83,12 @@ class DayProtocol(NamedTuple):
     def show(self) -> None:
         """Print the rows, what those need that are not done, and where the results are."""
         cells = [(each.row, _amount(row, each), each.result, each.text) for row, each in self._rows()]
-        table(f"Protocol in {self.folder}", ("", "value (limit)", "", "what was measured"), cells, text="what was measured")
+        table(
+            f"Protocol in {self.folder}",
+            ("", "value (limit)", "", "what was measured"),
+            cells,
+            text="what was measured",
+        )
         for row, each in self._rows():
             if each.result == NOT_DONE:
                 for line in (f"{row.name}: {row.mount}", row.command, f"passes: {row.passes}; {row.why}"):
@@ -113,7 +118,8 @@ class Day:
     """
 
     def __init__(self, asked: Config, file: Path | None, sets: Mapping[str, Any], folder: Path, hand: Hand) -> None:
-        self.asked, self.folder, self.hand = asked, folder, hand
+        self.asked, self.folder = asked, folder
+        self.hand: Hand = hand
         self.config: ResolvedConfig = resolve(asked, load_chip(asked.chip))
         self.sessions: dict[str, Path] = {}  # by name of the run
         given = (f"{key}={json.dumps(value)}" for key, value in sets.items())
@@ -127,7 +133,9 @@ class Day:
         """Start `flowrec record` in a process of its own, as a person in another terminal would."""
         words = ["record", *self._words, "--out", str(session), *_as_options(sets)]
         say(f"  flowrec {' '.join(words)}")
-        return start_child("flowrec", *words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        return start_child(
+            "flowrec", *words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
 
     def run(self, name: str, *sets: str) -> Session:
         """The session of a run, which is recorded once.
@@ -146,7 +154,9 @@ class Day:
                 process.communicate()
                 raise
             if not path.exists():
-                raise FlowrecError(f"flowrec record: {said[-1].removeprefix('flowrec: ') if said else 'it says nothing'}")
+                raise FlowrecError(
+                    f"flowrec record: {said[-1].removeprefix('flowrec: ') if said else 'it says nothing'}"
+                )
             self.sessions[name] = path
         return Session(self.sessions[name])
 
@@ -227,8 +237,7 @@ def _read(file: Path, key: str) -> dict[str, RowResult]:
         except ValueError:
             continue
         if isinstance(values, dict) and values.pop("configuration", None) == key:
-            result = RowResult(**{name: values.get(name) for name in RowResult._fields})
-            found[result.row] = result
+            found[str(values["row"])] = RowResult(**values)
     return found
 
 
@@ -252,5 +261,3 @@ def _plain(value: float | None) -> float | None:
 
 def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
-
-

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from flowrec.core import FlowrecError, Outcome
-from flowrec.measure import calibrate_coils, calibrate_image, calibrate_motion
 from flowrec.stages import LAB, flow_error
 from flowrec.store import Session
 from flowrec.verbs.check import check
@@ -23,6 +22,7 @@ from flowrec.verbs.user_flow import refine
 from flowrec.verbs.ways_out import zero_on_ways
 
 if TYPE_CHECKING:
+    from flowrec.measure import MotionFit
     from flowrec.verbs.protocol import Day
 
 _DRIVEN = 0.7  # share of the highest frequency that a run reaches, from which on it tells of step-out
@@ -73,6 +73,8 @@ class Row(NamedTuple):
 
 
 def _scale(day: Day) -> Measured:
+    from flowrec.measure import calibrate_image
+
     session = day.run("still", "mission.phases=observe", "mission.check_axes=false", "duration_s=2")
     found = calibrate_image(session.path, day.asked)
     stated = day.config.camera.um_per_px
@@ -86,20 +88,28 @@ def _motion_session(day: Day) -> Session:
     return day.run("motion", "mission.phases=survey", "duration_s=40")
 
 
+def _motion_fit(session: Session) -> MotionFit:
+    from flowrec.measure import calibrate_motion
+
+    return calibrate_motion(session.path).fit
+
+
 def _axes(day: Day) -> Measured:
     session = _motion_session(day)
     seen = session.last.axes
     if seen is not None and session.outcome.get("axes_check") == "contradicts":
         return Measured(180.0, 5.0, seen.text, session.path)
-    fit = calibrate_motion(session.path).fit
+    fit = _motion_fit(session)
     off_deg = 180.0 if fit.mirrored else abs(math.degrees(fit.heading_offset_rad))
-    text = "the y axes of coils and image are opposed" if fit.mirrored else f"the robot travels {off_deg:.1f} degrees off"
+    text = (
+        "the y axes of coils and image are opposed" if fit.mirrored else f"the robot travels {off_deg:.1f} degrees off"
+    )
     return Measured(off_deg, 5.0, text, session.path)
 
 
 def _latency(day: Day) -> Measured:
     session = _motion_session(day)
-    fit = calibrate_motion(session.path).fit
+    fit = _motion_fit(session)
     found_ms, stated_ms = -1e3 * fit.offset_s, 1e3 * day.config.robot.delay_s
     text = f"{found_ms:.1f} ± {1e3 * fit.offset_std_s:.1f} ms from command to motion, {stated_ms:g} stated"
     return Measured(abs(found_ms - stated_ms), 1e3 / day.config.camera.rate_hz, text, session.path)
@@ -107,7 +117,7 @@ def _latency(day: Day) -> Measured:
 
 def _um_per_rev(day: Day) -> Measured:
     session = _motion_session(day)
-    fit, stated = calibrate_motion(session.path).fit, day.config.robot.um_per_rev
+    fit, stated = _motion_fit(session), day.config.robot.um_per_rev
     text = f"{fit.um_per_rev:.2f} ± {fit.um_per_rev_std:.2f} um per revolution, {stated:g} stated"
     return Measured(100.0 * abs(fit.um_per_rev / stated - 1.0), 10.0, text, session.path)
 
@@ -116,7 +126,9 @@ def _step_out(day: Day) -> Measured:
     session, robot = _motion_session(day), day.config.robot
     driven_hz = max((each.frequency_hz for each in session.messages("currents")), default=0.0)
     limits = [each.limit_hz for each in session.messages("health") if each.limit_hz is not None]
-    highest_hz = min(robot.step_out_margin * robot.step_out_hz, robot.frequency_hz(robot.max_speed_um_s / robot.um_per_rev))
+    highest_hz = min(
+        robot.step_out_margin * robot.step_out_hz, robot.frequency_hz(robot.max_speed_um_s / robot.um_per_rev)
+    )
     if limits:
         text = f"the robot follows up to {min(limits):.3g} Hz, robot.step_out_hz = {robot.step_out_hz:g} is stated"
         return Measured(100.0 * max(1.0 - min(limits) / highest_hz, 0.0), 0.0, text, session.path)
@@ -126,6 +138,8 @@ def _step_out(day: Day) -> Measured:
 
 
 def _field(day: Day) -> Measured:
+    from flowrec.measure import calibrate_coils
+
     given = day.hand.read("field_table", "File of the readings (CSV: i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt)")
     if not given:
         raise NotDoneError("no table of a Hall probe: flowrec calibrate coils --help describes it")
@@ -220,7 +234,7 @@ ROWS = (
     ),
     Row(
         *("field", "error of the field of a coil per ampere", "%"),
-        "A Hall probe where the robot will be, no robot. Drive each coil alone, both ways, and note currents and field.",
+        "A Hall probe where the robot will be, no robot. Drive each coil alone, both ways; note currents and field.",
         "flowrec calibrate coils TABLE.csv",
         "each column of coils.mt_per_a is right to 5 %",
         "step-out falls with the field, and robot.step_out_margin leaves 10 % for it and all else",
