@@ -242,13 +242,14 @@ def _read(file: Path, key: str) -> dict[str, RowResult]:
 
 
 def _line(row: Row, found: RowResult) -> str:
-    return f"{_SIGNS[found.result]} {found.row:10s} {found.result:8s} {_amount(row, found)}: {found.text}"
+    amount = (
+        "" if found.value is None else f"{_amount(found.value, row.unit)} (at most {_amount(found.limit, row.unit)}), "
+    )
+    return f"{_SIGNS[found.result]} {found.row:10s} {found.result:8s} {amount}{found.text}"
 
 
-def _amount(row: Row, found: RowResult) -> str:
-    if found.value is None or found.limit is None:
-        return ""
-    return f"{found.value:.3g} ({found.limit:.3g}) {row.unit}"
+def _amount(value: float | None, unit: str) -> str:
+    return "" if value is None else f"{value:.3g} {unit}"
 
 
 def _as_options(sets: Iterable[str]) -> list[str]:
