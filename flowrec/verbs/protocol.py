@@ -82,13 +82,12 @@ class DayProtocol(NamedTuple):
 
     def show(self) -> None:
         """Print the rows, what those need that are not done, and where the results are."""
-        cells = [(each.row, _amount(row, each), each.result, each.text) for row, each in self._rows()]
-        table(
-            f"Protocol in {self.folder}",
-            ("", "value (limit)", "", "what was measured"),
-            cells,
-            text="what was measured",
-        )
+        cells = [
+            (each.row, _amount(each.value, row.unit), _amount(each.limit, row.unit), each.result, each.text)
+            for row, each in self._rows()
+        ]
+        columns = ("", "value", "at most", "", "what was measured")
+        table(f"Protocol in {self.folder}", columns, cells, text=columns[-1])
         for row, each in self._rows():
             if each.result == NOT_DONE:
                 for line in (f"{row.name}: {row.mount}", row.command, f"passes: {row.passes}; {row.why}"):

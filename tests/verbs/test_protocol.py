@@ -185,12 +185,12 @@ def test_on_a_simulated_rig_all_that_needs_no_instrument_passes_and_the_session_
 
 DEFECTS = {
     "the y coil is connected the other way round": (
-        ("--world", "coils.mt_per_a=[[2.0,0.0,0.0],[0.0,-2.0,0.0],[0.0,0.0,1.5]]"),
+        ("--world", "coils.mt_per_a=[[2.1,0.0,0.0],[0.0,-1.9,0.0],[0.0,0.0,1.5]]"),
         {"axes": FAILED},
     ),
     "the camera is late": (("--camera-delay-ms", "130"), {"latency": FAILED}),
     "the field is 20 % weak": (
-        ("--world", "coils.mt_per_a=[[1.6,0.0,0.0],[0.0,1.6,0.0],[0.0,0.0,1.2]]"),
+        ("--world", "coils.mt_per_a=[[1.68,0.0,0.0],[0.0,1.52,0.0],[0.0,0.0,1.2]]"),
         {"field": FAILED, "axes": PASSED},
     ),
 }
