@@ -123,7 +123,7 @@ def _um_per_rev(day: Day) -> Measured:
 
 
 def _step_out(day: Day) -> Measured:
-    session, robot = _motion_session(day), day.config.robot
+    session, robot = day.run("fast", "mission.phases=plan,navigate"), day.config.robot
     driven_hz = max((each.frequency_hz for each in session.messages("currents")), default=0.0)
     limits = [each.limit_hz for each in session.messages("health") if each.limit_hz is not None]
     highest_hz = min(
@@ -226,9 +226,9 @@ ROWS = (
     ),
     Row(
         *("step_out", "part of the frequencies that the robot does not follow", "%"),
-        "As before: the same run is read.",
-        _MOTION,
-        "the robot follows the field up to the frequency of the fastest command",
+        "The robot at its start again.",
+        "flowrec record CONFIG -o PROTOCOL/fast.mcap --set mission.phases=plan,navigate",
+        "the health of the run has found no frequency above which the robot does not follow",
         "a robot that steps out is slower than planned, where the flow is fastest",
         _step_out,
     ),

@@ -163,7 +163,7 @@ def test_the_emulated_ammeter_tells_when_the_last_current_went(
     assert meter.zero_after_s(since_ns, 1.0) == np.inf
 
 
-@pytest.mark.slow("records four missions in processes of their own")
+@pytest.mark.slow("records five missions in processes of their own")
 def test_on_a_simulated_rig_all_that_needs_no_instrument_passes_and_the_session_of_the_mission_has_it_as_a_note(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,9 +178,32 @@ def test_on_a_simulated_rig_all_that_needs_no_instrument_passes_and_the_session_
     (note,) = Session(told["session"]).notes
     assert note.tags == ("protocol",) and [line[2:].split()[0] for line in note.text.splitlines()] == NAMES
     before = {file: file.stat().st_mtime_ns for file in folder.glob("*.mcap")}
-    assert len(before) == 4
+    assert len(before) == 5
     assert run(words) == 3
     assert {file: file.stat().st_mtime_ns for file in folder.glob("*.mcap")} == before, "nothing is recorded again"
+
+
+WORLDS = {
+    "scale": "um_per_px=20.6",
+    "axes": "mirror=true",
+    "latency": "delay_s=0.08",
+    "um_per_rev": "um_per_rev_share=1.2",
+    "step_out": "step_out_share=0.6",
+    "flow": "inlet_speed_share=1.8",
+}
+
+
+@pytest.mark.slow("records missions in processes of their own")
+@pytest.mark.parametrize("row", WORLDS)
+def test_a_defect_of_the_simulated_world_fails_the_row_that_is_for_it(
+    row: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sets = [*SMALL, "camera.um_per_px=20", "robot.delay_s=0.04", "simulated.tracers=60", "mission.check_axes=true"]
+    words = ["doctor", "--protocol", "--folder", tmp_path, "--answer", MOUNTED, "--json", "--only", row]
+    assert run([*words, *(word for each in [*sets, f"simulated.{WORLDS[row]}"] for word in ("--set", each))]) == 1
+    found = {each["row"]: each for each in json.loads(capsys.readouterr().out)["rows"]}
+    assert found[row]["result"] == FAILED and found[row]["value"] is not None, found[row]
+    assert {each["result"] for name, each in found.items() if name != row} == {NOT_DONE}
 
 
 DEFECTS = {
@@ -222,7 +245,7 @@ def test_on_an_emulated_lab_that_is_as_stated_all_ten_pass(tmp_path: Path, capsy
 
 def run_protocol(folder: Path, words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
     """The result of each row on the emulated lab."""
-    sets = ["simulated.world=kind", "simulated.tracers=60", *PATIENT]
+    sets = ["simulated.world=kind", "simulated.tracers=60", "recording.accept_losses=true", *PATIENT]
     command = ["emulate", "lab", "-o", folder / "lab.toml", "--protocol", folder / "day", "--json", *words]
     run([*command, *(word for each in sets for word in ("--set", each))])
     printed = capsys.readouterr()
