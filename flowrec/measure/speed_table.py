@@ -1,0 +1,155 @@
+"""The speed of a robot over the frequency of its field, by its motion: the table `robot.speed_at_hz`.
+
+In each short window in which the frequency holds, the velocity is s(f) h + c v: h the heading of the log, turned as the
+fit of the motion found, v the known flow with a scale c of its own. s is linear between the pairs of the table and from
+0 to the first one, so the speeds of the pairs follow by least squares, with weights of Student's t distribution.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flowrec.core import Z95, Floats, FlowField
+from flowrec.measure.motion_fit import MotionFit
+from flowrec.measure.motion_regression import Turns
+from flowrec.physics import Robot, sample
+from flowrec.stages import FREEDOM, FieldLog
+
+_WINDOW_S = 0.25  # longer than the noise of a track, shorter than most commands hold
+_STEADY = 0.05  # relative change of the rate of the turns within a window, at most
+_EACH = 15  # windows for each pair, at least
+_MOST = 6  # pairs
+_APART = 1.15  # ratio of the frequencies of two pairs, at least
+_REWEIGHTINGS = 5
+_BENT = 1.3  # ratio of the largest to the smallest um per revolution over the frequency, from which on it is told
+_GAIN = 0.02  # systematic error, relative, as of um per revolution
+
+
+class SpeedTable(NamedTuple):
+    """Pairs of frequency (Hz) and speed (um/s), both rising, and the standard errors of the speeds.
+
+    `why_not` : why there are none, as words after a colon; '' if there are.
+    """
+
+    pairs: tuple[tuple[float, float], ...]
+    std_um_s: tuple[float, ...]
+    why_not: str = ""
+
+
+def fit_speed_table(
+    time_s: Floats, positions_um: Floats, turns: Turns, fit: MotionFit, flow: FlowField | None = None
+) -> SpeedTable:
+    """The table of a track (n,) and (n, 2), whose turns of the field are those of the log, not of a table.
+
+    Parameters
+    ----------
+    fit : of the same track: offset, rate and heading of the log.
+    flow : known one, which carries the robot; its scale is fitted.
+    """
+    first = np.unique(np.searchsorted(time_s, np.arange(time_s[0], time_s[-1], _WINDOW_S)))
+    begin, end = first[:-1], first[1:]
+    span_s = time_s[end] - time_s[begin]
+    at_s, middle_s = fit.offset_s + fit.rate * time_s, 0.5 * (time_s[begin] + time_s[end])
+    turned = turns(at_s)
+    halves = turns(fit.offset_s + fit.rate * middle_s)
+    early, late = halves - turned[begin], turned[end] - halves
+    whole = early + late
+    size = np.hypot(*whole.T)
+    steady = np.hypot(*(late - early).T) < _STEADY * size
+    used = steady & (span_s > 0.5 * _WINDOW_S) & (span_s < 2.0 * _WINDOW_S) & (size > 0.0)
+    frequency_hz = size[used] / span_s[used]
+    knots_hz = _knots(frequency_hz)
+    if len(knots_hz) < 2:
+        apart = f", about {knots_hz[0]:.3g} Hz" if len(knots_hz) else ""
+        why = f"the field holds one frequency only{apart}; record with a wider range of speeds, as a survey has it"
+        return SpeedTable((), (), why)
+    heading = whole[used] / size[used, None]
+    velocity = (positions_um[end] - positions_um[begin])[used] / span_s[used, None]
+    places = 0.5 * (positions_um[end] + positions_um[begin])[used]
+    carried = np.zeros_like(velocity) if flow is None else np.array([sample(flow, place) for place in places])
+    speeds, std = _speeds(frequency_hz, knots_hz, _turned(heading, fit), velocity, carried)
+    return _rising(knots_hz, speeds, std)
+
+
+def _knots(frequency_hz: Floats) -> Floats:
+    """(k,) frequencies of pairs: means of equally many windows, far enough apart."""
+    count = min(len(frequency_hz) // _EACH, _MOST)
+    if not count:
+        return np.zeros(0)
+    means = np.array([part.mean() for part in np.array_split(np.sort(frequency_hz), count)])
+    kept = [means[0]]
+    for mean in means[1:]:
+        if mean > _APART * kept[-1]:
+            kept.append(mean)
+    return np.array(kept)
+
+
+def _turned(heading: Floats, fit: MotionFit) -> Floats:
+    """Headings of the log as directions in the chip."""
+    x, y = heading.T
+    y = -y if fit.mirrored else y
+    c, s = np.cos(fit.heading_offset_rad), np.sin(fit.heading_offset_rad)
+    return np.column_stack([c * x - s * y, s * x + c * y])
+
+
+def _speeds(
+    frequency_hz: Floats, knots_hz: Floats, heading: Floats, velocity: Floats, carried: Floats
+) -> tuple[Floats, Floats]:
+    """Speeds (k,) at the knots and their standard errors, by weighted least squares."""
+    at_hz = np.append(0.0, knots_hz)
+    hats = np.column_stack([np.interp(frequency_hz, at_hz, np.eye(len(at_hz))[n]) for n in range(1, len(at_hz))])
+    columns = [(hats[:, n, None] * heading).ravel() for n in range(len(knots_hz))]
+    columns += [carried.ravel()] if carried.any() else []
+    X, y = np.column_stack(columns), velocity.ravel()
+    weight = np.ones(len(velocity))
+    for _ in range(_REWEIGHTINGS):
+        W = np.repeat(weight, 2)
+        unscaled = np.linalg.pinv(X.T @ (W[:, None] * X))
+        found = unscaled @ X.T @ (W * y)
+        square = ((y - X @ found).reshape(-1, 2) ** 2).sum(axis=1)
+        variance = float((weight * square).sum()) / max(len(y) - len(found), 1)
+        weight = (FREEDOM + 2.0) / (FREEDOM + square / max(variance, 1e-12))
+    std = np.sqrt(variance * np.diag(unscaled))
+    count = len(knots_hz)
+    return found[:count], np.hypot(std[:count], _GAIN * found[:count])
+
+
+def _rising(knots_hz: Floats, speeds: Floats, std: Floats) -> SpeedTable:
+    """The pairs up to the fastest speed, each faster than the one before."""
+    last = int(np.argmax(speeds))
+    kept = [n for n in range(last + 1) if speeds[n] > max(speeds[:n], default=0.0)]
+    if len(kept) < 2:
+        return SpeedTable((), (), "the speed does not rise with the frequency; does the robot step out at all of them")
+    pairs = tuple((float(f"{knots_hz[n]:.4g}"), float(f"{speeds[n]:.4g}")) for n in kept)
+    return SpeedTable(pairs, tuple(float(std[n]) for n in kept))
+
+
+def proportional_log(log: FieldLog, robot: Robot) -> FieldLog:
+    """The log of a field in which the robot without a table moves as this one does in that of `log`."""
+    if not robot.speed_at_hz:
+        return log
+    as_moved_hz = [robot.proportional_hz(each) for each in log.frequency_hz.tolist()]
+    return FieldLog(log.times_ns, as_moved_hz, log.heading_rad, log.amplitude_mt, log.currents_a)
+
+
+def propose_table(found: SpeedTable, robot: Robot, sets: dict[str, Any]) -> list[str]:
+    """Put a table into the settings of a robot that has one; sentences on it. Of another robot it is only named."""
+    if robot.speed_at_hz and found.why_not:
+        return [f"robot.speed_at_hz is not fitted: {found.why_not}"]
+    if not found.pairs:
+        return []
+    stated = [robot.um_per_rev * robot.proportional_hz(hz) for hz, _ in found.pairs]
+    errors = zip(found.pairs, found.std_um_s, stated, strict=True)
+    off = [100.0 * (um_s / known - 1.0) for (_, um_s), std, known in errors if abs(um_s - known) > Z95 * std]
+    text = ", ".join(f"{um_s:.4g} ± {std:.2g} um/s at {hz:.3g} Hz" for (hz, um_s), std in zip(*found[:2], strict=True))
+    if robot.speed_at_hz:
+        del sets["robot.um_per_rev"]  # that of the first pair
+        sets["robot.speed_at_hz"] = found.pairs
+        differ = f"; the stated table is up to {max(off, key=abs):+.0f} % off" if off else "; the stated table agrees"
+        return [f"speeds: {text}{differ}"]
+    slopes = [um_s / hz for hz, um_s in found.pairs]
+    if max(slopes) < _BENT * min(slopes):
+        return []
+    return [f"the speed is not in proportion to the frequency ({text}): set robot.speed_at_hz = {list(found.pairs)}"]
