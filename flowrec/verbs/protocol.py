@@ -28,7 +28,6 @@ from flowrec.verbs.protocol_rows import ROWS, Row
 PASSED, FAILED, NOT_DONE = "pass", "fail", "not done"
 RESULTS = "protocol.jsonl"
 _TAG = "protocol"
-_SIGNS = {PASSED: " ", FAILED: "x", NOT_DONE: "-"}
 
 
 class RowResult(NamedTuple):
@@ -244,7 +243,7 @@ def _line(row: Row, found: RowResult) -> str:
     amount = (
         "" if found.value is None else f"{_amount(found.value, row.unit)} (at most {_amount(found.limit, row.unit)}), "
     )
-    return f"{_SIGNS[found.result]} {found.row:10s} {found.result:8s} {amount}{found.text}"
+    return f"{found.row:10s} {found.result:8s} {amount}{found.text}"
 
 
 def _amount(value: float | None, unit: str) -> str:

@@ -72,10 +72,14 @@ class Row(NamedTuple):
     measure: Callable[[Day], Measured]
 
 
+def _still_session(day: Day) -> Session:
+    return day.run("still", "mission.phases=observe", "mission.check_axes=false", "duration_s=2")
+
+
 def _scale(day: Day) -> Measured:
     from flowrec.measure import calibrate_image
 
-    session = day.run("still", "mission.phases=observe", "mission.check_axes=false", "duration_s=2")
+    session = _still_session(day)
     found = calibrate_image(session.path, day.asked)
     stated = day.config.camera.um_per_px
     scales = [pose.calibration.um_per_px for pose in found.poses]
@@ -95,6 +99,12 @@ def _motion_fit(session: Session) -> MotionFit:
 
 
 def _axes(day: Day) -> Measured:
+    from flowrec.measure import orientation_by_image
+
+    still = _still_session(day)
+    seen_image = orientation_by_image(next(still.messages("frame")).image, still.chip, still.calibration)
+    if seen_image.contradiction:
+        return Measured(180.0, 5.0, seen_image.text, still.path)
     session = _motion_session(day)
     seen = session.last.axes
     if seen is not None and session.outcome.get("axes_check") == "contradicts":
@@ -159,7 +169,7 @@ def _flow(day: Day) -> Measured:
         raise NotDoneError(f"{session.path.name}: no bead was followed; more of them, or tracker.tracer.radius_um")
     config, chip, assumed = session.config, session.chip, session.fields["assumed"]
     refined = refine(chip, beads, refiner=replace(config.refine, adopt="always"), solver=config.flow)
-    off, share = flow_error(chip, assumed, refined), assumed.error_share or refined.error_share
+    off, share = flow_error(chip, refined, assumed), assumed.error_share or refined.error_share
     if refined.refused or off is None or share is None:
         raise NotDoneError(f"{session.path.name}: the beads do not tell the flow: {refined.refused or refined.note}")
     text = f"{len(beads.position_um)} stretches of beads change the assumed flow by {100.0 * off:.0f} %"

@@ -176,7 +176,7 @@ def test_on_a_simulated_rig_all_that_needs_no_instrument_passes_and_the_session_
     found = {row["row"]: row["result"] for row in told["rows"]}
     assert [name for name, result in found.items() if result != PASSED] == ["field", "zero"], told
     (note,) = Session(told["session"]).notes
-    assert note.tags == ("protocol",) and [line[2:].split()[0] for line in note.text.splitlines()] == NAMES
+    assert note.tags == ("protocol",) and [line.split()[0] for line in note.text.splitlines()] == NAMES
     before = {file: file.stat().st_mtime_ns for file in folder.glob("*.mcap")}
     assert len(before) == 5
     assert run(words) == 3
