@@ -19,12 +19,12 @@ from flowrec.stages import FREEDOM, FieldLog
 
 _WINDOW_S = 0.25  # longer than the noise of a track, shorter than most commands hold
 _STEADY = 0.05  # relative change of the rate of the turns within a window, at most
-_EACH = 15  # windows for each pair, at least
+_EACH = 8  # windows of each pair, at least
 _MOST = 6  # pairs
-_APART = 1.15  # ratio of the frequencies of two pairs, at least
+_APART = 1.15  # ratio of the bounds of the frequencies of a pair, at least
 _REWEIGHTINGS = 5
 _BENT = 1.3  # ratio of the largest to the smallest um per revolution over the frequency, from which on it is told
-_GAIN = 0.02  # systematic error, relative, as of um per revolution
+_GAIN = 0.03  # systematic error, relative: the flow along the way changes with the robot's own motion
 
 
 class SpeedTable(NamedTuple):
@@ -74,15 +74,17 @@ def fit_speed_table(
 
 
 def _knots(frequency_hz: Floats) -> Floats:
-    """(k,) frequencies of pairs: means of equally many windows, far enough apart."""
-    count = min(len(frequency_hz) // _EACH, _MOST)
-    if not count:
+    """(k,) frequencies of pairs: medians of bins of equal ratios, where there are enough windows."""
+    if not len(frequency_hz):
         return np.zeros(0)
-    means = np.array([part.mean() for part in np.array_split(np.sort(frequency_hz), count)])
-    kept = [means[0]]
-    for mean in means[1:]:
-        if mean > _APART * kept[-1]:
-            kept.append(mean)
+    ratio = np.log(frequency_hz / frequency_hz.min())
+    width = max(float(np.log(_APART)), float(ratio.max()) / _MOST * (1.0 + 1e-9))
+    bins = (ratio / width).astype(int)
+    parts = [frequency_hz[bins == number] for number in np.unique(bins)]
+    kept: list[float] = []
+    for part in parts:
+        if len(part) >= _EACH and (not kept or np.median(part) > _APART * kept[-1]):
+            kept.append(float(np.median(part)))
     return np.array(kept)
 
 
