@@ -1,7 +1,7 @@
 """The speed of a robot over the frequency of its field, by its motion: the table `robot.speed_at_hz`.
 
-In each short window in which the frequency holds, the velocity is s(f) h + c v: h the heading of the log, turned as the
-fit of the motion found, v the known flow with a scale c of its own. s is linear between the pairs of the table and from
+In each short window the mean velocity is that of s(f) h + c v: h the heading of the log, turned as the fit of the
+motion found, v the known flow with a scale c of its own. s is linear between the pairs of the table and from
 0 to the first one, so the speeds of the pairs follow by least squares, with weights of Student's t distribution.
 """
 
@@ -18,7 +18,8 @@ from flowrec.physics import Robot, sample
 from flowrec.stages import FREEDOM, FieldLog
 
 _WINDOW_S = 0.25  # longer than the noise of a track, shorter than most commands hold
-_STEADY = 0.05  # relative change of the rate of the turns within a window, at most
+_PARTS = 8  # of a window, in which frequency and heading hold
+_RARE = 0.05  # share of the slowest and of the fastest steps that make no pair
 _EACH = 8  # windows of each pair, at least
 _MOST = 6  # pairs
 _APART = 1.15  # ratio of the bounds of the frequencies of a pair, at least
@@ -49,60 +50,57 @@ def fit_speed_table(
     flow : known one, which carries the robot; its scale is fitted.
     """
     first = np.unique(np.searchsorted(time_s, np.arange(time_s[0], time_s[-1], _WINDOW_S)))
-    begin, end = first[:-1], first[1:]
-    span_s = time_s[end] - time_s[begin]
-    at_s, middle_s = fit.offset_s + fit.rate * time_s, 0.5 * (time_s[begin] + time_s[end])
-    turned = turns(at_s)
-    halves = turns(fit.offset_s + fit.rate * middle_s)
-    early, late = halves - turned[begin], turned[end] - halves
-    whole = early + late
-    size = np.hypot(*whole.T)
-    steady = np.hypot(*(late - early).T) < _STEADY * size
-    used = steady & (span_s > 0.5 * _WINDOW_S) & (span_s < 2.0 * _WINDOW_S) & (size > 0.0)
-    frequency_hz = size[used] / span_s[used]
-    knots_hz = _knots(frequency_hz)
+    span_s = np.diff(time_s[first])
+    used = (span_s > 0.5 * _WINDOW_S) & (span_s < 2.0 * _WINDOW_S)
+    begin, end, span_s = first[:-1][used], first[1:][used], span_s[used]
+    parts = time_s[begin, None] + span_s[:, None] * np.arange(_PARTS + 1) / _PARTS
+    turned = turns(fit.offset_s + fit.rate * parts.ravel()).reshape(*parts.shape, 2)
+    steps = _turned(np.diff(turned, axis=1), fit)
+    frequency_hz = np.hypot(steps[..., 0], steps[..., 1]) * (_PARTS / span_s[:, None])
+    knots_hz = _knots(frequency_hz[frequency_hz > 0.0])
     if len(knots_hz) < 2:
         apart = f", about {knots_hz[0]:.3g} Hz" if len(knots_hz) else ""
-        why = f"the field holds one frequency only{apart}; record with a wider range of speeds, as a survey has it"
+        why = f"the field has one frequency only{apart}; record with a wider range of speeds, as a survey has it"
         return SpeedTable((), (), why)
-    heading = whole[used] / size[used, None]
-    velocity = (positions_um[end] - positions_um[begin])[used] / span_s[used, None]
-    places = 0.5 * (positions_um[end] + positions_um[begin])[used]
+    velocity = (positions_um[end] - positions_um[begin]) / span_s[:, None]
+    places = 0.5 * (positions_um[end] + positions_um[begin])
     carried = np.zeros_like(velocity) if flow is None else np.array([sample(flow, place) for place in places])
-    speeds, std = _speeds(frequency_hz, knots_hz, _turned(heading, fit), velocity, carried)
-    return _rising(knots_hz, speeds, std)
+    return _rising(knots_hz, *_speeds(frequency_hz, knots_hz, steps, velocity, carried))
 
 
 def _knots(frequency_hz: Floats) -> Floats:
     """(k,) frequencies of pairs: medians of bins of equal ratios, where there are enough windows."""
     if not len(frequency_hz):
         return np.zeros(0)
+    low_hz, high_hz = np.quantile(frequency_hz, (_RARE, 1.0 - _RARE))  # a step across a change has any
+    frequency_hz = frequency_hz[(frequency_hz >= low_hz * (1.0 - 1e-9)) & (frequency_hz <= high_hz * (1.0 + 1e-9))]
     ratio = np.log(frequency_hz / frequency_hz.min())
     width = max(float(np.log(_APART)), float(ratio.max()) / _MOST * (1.0 + 1e-9))
     bins = (ratio / width).astype(int)
     parts = [frequency_hz[bins == number] for number in np.unique(bins)]
     kept: list[float] = []
     for part in parts:
-        if len(part) >= _EACH and (not kept or np.median(part) > _APART * kept[-1]):
+        if len(part) >= _EACH * _PARTS and (not kept or np.median(part) > _APART * kept[-1]):
             kept.append(float(np.median(part)))
     return np.array(kept)
 
 
-def _turned(heading: Floats, fit: MotionFit) -> Floats:
-    """Headings of the log as directions in the chip."""
-    x, y = heading.T
-    y = -y if fit.mirrored else y
+def _turned(steps: Floats, fit: MotionFit) -> Floats:
+    """Turns (..., 2) of the log as turns in the chip."""
+    x, y = steps[..., 0], -steps[..., 1] if fit.mirrored else steps[..., 1]
     c, s = np.cos(fit.heading_offset_rad), np.sin(fit.heading_offset_rad)
-    return np.column_stack([c * x - s * y, s * x + c * y])
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
 def _speeds(
-    frequency_hz: Floats, knots_hz: Floats, heading: Floats, velocity: Floats, carried: Floats
+    frequency_hz: Floats, knots_hz: Floats, steps: Floats, velocity: Floats, carried: Floats
 ) -> tuple[Floats, Floats]:
     """Speeds (k,) at the knots and their standard errors, by weighted least squares."""
     at_hz = np.append(0.0, knots_hz)
-    hats = np.column_stack([np.interp(frequency_hz, at_hz, np.eye(len(at_hz))[n]) for n in range(1, len(at_hz))])
-    columns = [(hats[:, n, None] * heading).ravel() for n in range(len(knots_hz))]
+    size = np.hypot(steps[..., 0], steps[..., 1])
+    headings = steps / np.maximum(size, 1e-12)[..., None]
+    ones = np.eye(len(at_hz))[1:]  # a speed of 1 at one of the knots
+    columns = [(np.interp(frequency_hz, at_hz, one)[..., None] * headings).mean(axis=1).ravel() for one in ones]
     columns += [carried.ravel()] if carried.any() else []
     X, y = np.column_stack(columns), velocity.ravel()
     weight = np.ones(len(velocity))
