@@ -23,7 +23,7 @@ _RARE = 0.05  # share of the slowest and of the fastest steps that make no pair
 _EACH = 8  # windows of each pair, at least
 _MOST = 6  # pairs
 _APART = 1.15  # ratio of the bounds of the frequencies of a pair, at least
-_REWEIGHTINGS = 5
+_REWEIGHTINGS = 5  # after which the weights hold
 _BENT = 1.3  # ratio of the largest to the smallest um per revolution over the frequency, from which on it is told
 _GAIN = 0.03  # systematic error, relative: the flow along the way changes with the robot's own motion
 
@@ -55,7 +55,7 @@ def fit_speed_table(
     begin, end, span_s = first[:-1][used], first[1:][used], span_s[used]
     parts = time_s[begin, None] + span_s[:, None] * np.arange(_PARTS + 1) / _PARTS
     turned = turns(fit.offset_s + fit.rate * parts.ravel()).reshape(*parts.shape, 2)
-    steps = _turned(np.diff(turned, axis=1), fit)
+    steps = _in_chip(np.diff(turned, axis=1), fit)
     frequency_hz = np.hypot(steps[..., 0], steps[..., 1]) * (_PARTS / span_s[:, None])
     knots_hz = _knots(frequency_hz[frequency_hz > 0.0])
     if len(knots_hz) < 2:
@@ -85,7 +85,7 @@ def _knots(frequency_hz: Floats) -> Floats:
     return np.array(kept)
 
 
-def _turned(steps: Floats, fit: MotionFit) -> Floats:
+def _in_chip(steps: Floats, fit: MotionFit) -> Floats:
     """Turns (..., 2) of the log as turns in the chip."""
     x, y = steps[..., 0], -steps[..., 1] if fit.mirrored else steps[..., 1]
     c, s = np.cos(fit.heading_offset_rad), np.sin(fit.heading_offset_rad)

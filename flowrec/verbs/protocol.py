@@ -23,7 +23,7 @@ from flowrec.physics import load_chip
 from flowrec.stages import Config, ResolvedConfig, resolve, to_toml
 from flowrec.store import Session
 from flowrec.verbs.protocol_hands import Hand, free_path
-from flowrec.verbs.protocol_rows import ROWS, Row
+from flowrec.verbs.protocol_rows import ROWS, ProtocolRow
 
 PASSED, FAILED, NOT_DONE = "pass", "fail", "not done"
 RESULTS = "protocol.jsonl"
@@ -31,7 +31,7 @@ _TAG = "protocol"
 
 
 class RowResult(NamedTuple):
-    """What came of a row.
+    """Result of a row.
 
     Attributes
     ----------
@@ -98,12 +98,12 @@ class DayProtocol(NamedTuple):
         """The results as text, a line each."""
         return "\n".join(_line(row, each) for row, each in self._rows())
 
-    def _rows(self) -> list[tuple[Row, RowResult]]:
+    def _rows(self) -> list[tuple[ProtocolRow, RowResult]]:
         return list(zip(ROWS, self.results, strict=True))
 
 
 class Day:
-    """What the rows measure with.
+    """Configuration, files and hands with which the rows measure.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def walk(
         known = results.get(row.name)
         if (row.name not in only) if only else (known is not None and known.result == PASSED):
             continue
-        found = _measured(row, day)
+        found = _measure(row, day)
         results[row.name] = found
         say(_line(row, found))
         if found.measured:
@@ -205,7 +205,7 @@ def walk(
     return done
 
 
-def _measured(row: Row, day: Day) -> RowResult:
+def _measure(row: ProtocolRow, day: Day) -> RowResult:
     """Measure a row; what stands against it is the text of one that is not done."""
     if not day.hand.ready(row):
         return RowResult(row.name, NOT_DONE, text="nobody has mounted it: --answer mounted=yes, or a terminal")
@@ -239,7 +239,7 @@ def _read(file: Path, key: str) -> dict[str, RowResult]:
     return found
 
 
-def _line(row: Row, found: RowResult) -> str:
+def _line(row: ProtocolRow, found: RowResult) -> str:
     amount = (
         "" if found.value is None else f"{_amount(found.value, row.unit)} (at most {_amount(found.limit, row.unit)}), "
     )

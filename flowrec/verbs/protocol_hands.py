@@ -11,23 +11,23 @@ from flowrec.core import UsageError, say
 
 if TYPE_CHECKING:
     from flowrec.rigs import EmulatedInstruments
-    from flowrec.verbs.protocol_rows import Row
+    from flowrec.verbs.protocol_rows import ProtocolRow
 
 MOUNTED = "mounted"  # the answer by which nobody is asked
 
 
 class Hand(Protocol):
-    """What a program can not do; `sees_zero`: somebody looks at an ammeter."""
+    """Hands and eyes, which a program does not have; `sees_zero`: somebody looks at an ammeter."""
 
     sees_zero: bool
 
-    def ready(self, row: Row) -> bool:
+    def ready(self, row: ProtocolRow) -> bool:
         """Have a row mounted; False: it is left out."""
 
     def read(self, key: str, question: str) -> str:
         """The answer to a question; '': there is none."""
 
-    def known(self, key: str) -> float | None:
+    def number(self, key: str) -> float | None:
         """A number that was answered before; None: it is to be measured."""
 
     def zero_after_s(self, way: str, since_ns: int, within_s: float) -> float:
@@ -50,13 +50,13 @@ class Answers:
                 raise UsageError(f"--answer {text!r}: expected key=value, as in --answer mounted=yes")
             self._given[key.strip()] = value.strip()
 
-    def ready(self, row: Row) -> bool:
+    def ready(self, row: ProtocolRow) -> bool:
         return self._given.get(MOUNTED) == "yes"
 
     def read(self, key: str, question: str) -> str:
         return self._given.get(key, "")
 
-    def known(self, key: str) -> float | None:
+    def number(self, key: str) -> float | None:
         text = self._given.get(key)
         try:
             return None if text is None else float(text)
@@ -75,22 +75,22 @@ class Person(Answers):
 
     sees_zero = True
 
-    def ready(self, row: Row) -> bool:
+    def ready(self, row: ProtocolRow) -> bool:
         say(f"{row.what}: {row.mount}")
-        return super().ready(row) or _asked("Enter when it is ready, s to leave it out: ") != "s"
+        return super().ready(row) or _ask("Enter when it is ready, s to leave it out: ") != "s"
 
     def read(self, key: str, question: str) -> str:
-        return super().read(key, question) or _asked(f"{question}: ")
+        return super().read(key, question) or _ask(f"{question}: ")
 
     def zero_after_s(self, way: str, since_ns: int, within_s: float) -> float:
-        text = _asked(f"{way}: after how many seconds did the ammeter read zero? (never: inf) ")
+        text = _ask(f"{way}: after how many seconds did the ammeter read zero? (never: inf) ")
         try:
             return float(text)
         except ValueError:
             raise UsageError(f"{text!r} is no number of seconds") from None
 
     def pull_cable(self, *, pulled: bool) -> None:
-        _asked(f"{'Pull the cable of the camera' if pulled else 'Plug the camera in again'}, then Enter: ")
+        _ask(f"{'Pull the cable of the camera' if pulled else 'Plug the camera in again'}, then Enter: ")
 
 
 class EmulatedHand(Answers):
@@ -125,7 +125,7 @@ def free_path(folder: Path, name: str, suffix: str) -> Path:
     return next(path for path in numbered if not path.exists() and not path.with_name(path.name + ".partial").exists())
 
 
-def _asked(question: str) -> str:
+def _ask(question: str) -> str:
     sys.stderr.write(question)
     sys.stderr.flush()
     return sys.stdin.readline().strip()

@@ -32,7 +32,7 @@ class NotDoneError(FlowrecError):
     """A measurement can not be made; the text says why."""
 
 
-class Measured(NamedTuple):
+class RowValue(NamedTuple):
     """A value, in the unit of its row.
 
     Attributes
@@ -48,7 +48,7 @@ class Measured(NamedTuple):
     session: Path | None = None
 
 
-class Row(NamedTuple):
+class ProtocolRow(NamedTuple):
     """One measurement.
 
     Attributes
@@ -69,14 +69,14 @@ class Row(NamedTuple):
     command: str
     passes: str
     why: str
-    measure: Callable[[Day], Measured]
+    measure: Callable[[Day], RowValue]
 
 
 def _still_session(day: Day) -> Session:
     return day.run("still", "mission.phases=observe", "mission.check_axes=false", "duration_s=2")
 
 
-def _scale(day: Day) -> Measured:
+def _scale(day: Day) -> RowValue:
     from flowrec.measure import calibrate_image
 
     session = _still_session(day)
@@ -85,7 +85,7 @@ def _scale(day: Day) -> Measured:
     scales = [pose.calibration.um_per_px for pose in found.poses]
     scale = max(scales, key=lambda each: abs(each - stated))  # of a chip that looks the same in several ways
     text = f"{scale:.5g} um per pixel, {stated:.5g} stated"
-    return Measured(100.0 * abs(scale / stated - 1.0), 1.0, text, session.path)
+    return RowValue(100.0 * abs(scale / stated - 1.0), 1.0, text, session.path)
 
 
 def _motion_session(day: Day) -> Session:
@@ -98,41 +98,41 @@ def _motion_fit(session: Session) -> MotionFit:
     return calibrate_motion(session.path).fit
 
 
-def _axes(day: Day) -> Measured:
+def _axes(day: Day) -> RowValue:
     from flowrec.measure import orientation_by_image
 
     still = _still_session(day)
     seen_image = orientation_by_image(next(still.messages("frame")).image, still.chip, still.calibration)
     if seen_image.contradiction:
-        return Measured(180.0, 5.0, seen_image.text, still.path)
+        return RowValue(180.0, 5.0, seen_image.text, still.path)
     session = _motion_session(day)
     seen = session.last.axes
     if seen is not None and session.outcome.get("axes_check") == "contradicts":
-        return Measured(180.0, 5.0, seen.text, session.path)
+        return RowValue(180.0, 5.0, seen.text, session.path)
     fit = _motion_fit(session)
     off_deg = 180.0 if fit.mirrored else abs(math.degrees(fit.heading_offset_rad))
     text = (
         "the y axes of coils and image are opposed" if fit.mirrored else f"the robot travels {off_deg:.1f} degrees off"
     )
-    return Measured(off_deg, 5.0, text, session.path)
+    return RowValue(off_deg, 5.0, text, session.path)
 
 
-def _latency(day: Day) -> Measured:
+def _latency(day: Day) -> RowValue:
     session = _motion_session(day)
     fit = _motion_fit(session)
     found_ms, stated_ms = -1e3 * fit.offset_s, 1e3 * day.config.robot.delay_s
     text = f"{found_ms:.1f} ± {1e3 * fit.offset_std_s:.1f} ms from command to motion, {stated_ms:g} stated"
-    return Measured(abs(found_ms - stated_ms), 1e3 / day.config.camera.rate_hz, text, session.path)
+    return RowValue(abs(found_ms - stated_ms), 1e3 / day.config.camera.rate_hz, text, session.path)
 
 
-def _um_per_rev(day: Day) -> Measured:
+def _um_per_rev(day: Day) -> RowValue:
     session = _motion_session(day)
     fit, stated = _motion_fit(session), day.config.robot.um_per_rev
     text = f"{fit.um_per_rev:.2f} ± {fit.um_per_rev_std:.2f} um per revolution, {stated:g} stated"
-    return Measured(100.0 * abs(fit.um_per_rev / stated - 1.0), 10.0, text, session.path)
+    return RowValue(100.0 * abs(fit.um_per_rev / stated - 1.0), 10.0, text, session.path)
 
 
-def _step_out(day: Day) -> Measured:
+def _step_out(day: Day) -> RowValue:
     session, robot = day.run("fast", "mission.phases=plan,navigate"), day.config.robot
     driven_hz = max((each.frequency_hz for each in session.messages("currents")), default=0.0)
     limits = [each.limit_hz for each in session.messages("health") if each.limit_hz is not None]
@@ -141,13 +141,13 @@ def _step_out(day: Day) -> Measured:
     )
     if limits:
         text = f"the robot follows up to {min(limits):.3g} Hz, robot.step_out_hz = {robot.step_out_hz:g} is stated"
-        return Measured(100.0 * max(1.0 - min(limits) / highest_hz, 0.0), 0.0, text, session.path)
+        return RowValue(100.0 * max(1.0 - min(limits) / highest_hz, 0.0), 0.0, text, session.path)
     if driven_hz < _DRIVEN * highest_hz:
         raise NotDoneError(f"{session.path.name}: it was driven at {driven_hz:.3g} Hz at most, of {highest_hz:.3g}")
-    return Measured(0.0, 0.0, f"the robot follows up to {driven_hz:.3g} Hz, the fastest of this run", session.path)
+    return RowValue(0.0, 0.0, f"the robot follows up to {driven_hz:.3g} Hz, the fastest of this run", session.path)
 
 
-def _field(day: Day) -> Measured:
+def _field(day: Day) -> RowValue:
     from flowrec.measure import calibrate_coils
 
     given = day.hand.read("field_table", "File of the readings (CSV: i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt)")
@@ -159,10 +159,10 @@ def _field(day: Day) -> Measured:
     off = np.linalg.norm(found - stated, axis=0) / np.linalg.norm(stated, axis=0)
     size = np.linalg.norm(found, axis=0) / np.linalg.norm(stated, axis=0)
     shares = ", ".join(f"{100.0 * each:.0f}" for each in size)
-    return Measured(100.0 * float(off.max()), 5.0, f"the coils make {shares} % of the stated field per ampere")
+    return RowValue(100.0 * float(off.max()), 5.0, f"the coils make {shares} % of the stated field per ampere")
 
 
-def _flow(day: Day) -> Measured:
+def _flow(day: Day) -> RowValue:
     session = day.run("tracers", "mission.phases=observe", "tracker.tracers=true", "duration_s=15")
     beads = session.last.tracer_flow
     if beads is None:
@@ -173,36 +173,36 @@ def _flow(day: Day) -> Measured:
     if refined.refused or off is None or share is None:
         raise NotDoneError(f"{session.path.name}: the beads do not tell the flow: {refined.refused or refined.note}")
     text = f"{len(beads.position_um)} stretches of beads change the assumed flow by {100.0 * off:.0f} %"
-    return Measured(100.0 * off, 200.0 * share, text, session.path)
+    return RowValue(100.0 * off, 200.0 * share, text, session.path)
 
 
-def _zero(day: Day) -> Measured:
+def _zero(day: Day) -> RowValue:
     if day.config.rig != LAB:
         raise NotDoneError(f"rig = {day.config.rig!r} has no coils that could stay on")
-    return Measured(*zero_on_ways(day))
+    return RowValue(*zero_on_ways(day))
 
 
-def _mission(day: Day) -> Measured:
+def _mission(day: Day) -> RowValue:
     session = day.run("mission")
     outcome = session.outcome
     ended, took_s, planned_s = (outcome.get(key) for key in ("outcome", "navigation_s", "planned_s"))
     if ended != Outcome.REACHED or not took_s or not planned_s:
         why = "; ".join(str(outcome[key]) for key in ("outcome", "note") if outcome.get(key))
-        return Measured(math.inf, 150.0, f"the goal was not reached: {why}", session.path)
+        return RowValue(math.inf, 150.0, f"the goal was not reached: {why}", session.path)
     text = f"reached in {float(took_s):.1f} s, planned {float(planned_s):.1f}"
-    return Measured(100.0 * float(took_s) / float(planned_s), 150.0, text, session.path)
+    return RowValue(100.0 * float(took_s) / float(planned_s), 150.0, text, session.path)
 
 
-def _replay(day: Day) -> Measured:
+def _replay(day: Day) -> RowValue:
     session = day.run("mission")
     verdict, again = check(session.path), replay_session(session.path, verify=True)
     text = f"flowrec check: {verdict.word}; replay: {again.lines()[-1]}"
-    return Measured(0.0 if again.same and verdict.word != "bad" else 1.0, 0.0, text, session.path)
+    return RowValue(0.0 if again.same and verdict.word != "bad" else 1.0, 0.0, text, session.path)
 
 
 _MOTION = "flowrec record CONFIG -o PROTOCOL/motion.mcap --set mission.phases=survey, then flowrec calibrate motion"
 ROWS = (
-    Row(
+    ProtocolRow(
         *("scale", "error of um per pixel", "%"),
         "The chip, filled, in focus, as it will lie in the missions; light and exposure as in them. No field is made.",
         "flowrec record CONFIG -o PROTOCOL/still.mcap --set mission.phases=observe, then flowrec calibrate image",
@@ -210,7 +210,7 @@ ROWS = (
         "an error of 3 % makes one of 6 % of the flow",
         _scale,
     ),
-    Row(
+    ProtocolRow(
         *("axes", "angle between heading and motion", "degrees"),
         "A robot at its start, the pump on; a hand on the emergency stop: the coils make a field from here on.",
         _MOTION,
@@ -218,7 +218,7 @@ ROWS = (
         "5 degrees put a robot a tenth of its way aside before the loop has seen it",
         _axes,
     ),
-    Row(
+    ProtocolRow(
         *("latency", "error of the time from command to motion", "ms"),
         "As before: the same run is read.",
         _MOTION,
@@ -226,7 +226,7 @@ ROWS = (
         "commands come once an image: what is finer changes none of them",
         _latency,
     ),
-    Row(
+    ProtocolRow(
         *("um_per_rev", "error of the way per revolution", "%"),
         "As before: the same run is read.",
         _MOTION,
@@ -234,7 +234,7 @@ ROWS = (
         "an error of 10 % makes one of 8 % of the flow, and a refinement finds what is left",
         _um_per_rev,
     ),
-    Row(
+    ProtocolRow(
         *("step_out", "part of the frequencies that the robot does not follow", "%"),
         "The robot at its start again.",
         "flowrec record CONFIG -o PROTOCOL/fast.mcap --set mission.phases=plan,navigate",
@@ -242,7 +242,7 @@ ROWS = (
         "a robot that steps out is slower than planned, where the flow is fastest",
         _step_out,
     ),
-    Row(
+    ProtocolRow(
         *("field", "error of the field of a coil per ampere", "%"),
         "A Hall probe where the robot will be, no robot. Drive each coil alone, both ways; note currents and field.",
         "flowrec calibrate coils TABLE.csv",
@@ -250,7 +250,7 @@ ROWS = (
         "step-out falls with the field, and robot.step_out_margin leaves 10 % for it and all else",
         _field,
     ),
-    Row(
+    ProtocolRow(
         *("flow", "change of the assumed flow by beads", "%"),
         "Beads of a fifth of the channel or less in the fluid, the pump on, no robot in the channel. No field is made.",
         "flowrec record CONFIG -o PROTOCOL/tracers.mcap --set mission.phases=observe --set tracker.tracers=true",
@@ -258,7 +258,7 @@ ROWS = (
         "beyond it pump, depth or chip are not those of the configuration",
         _flow,
     ),
-    Row(
+    ProtocolRow(
         *("zero", "time until the coils are off, of the time that is allowed", "%"),
         "An ammeter or a clamp in the line of a coil. The robot may be left out.",
         "flowrec record CONFIG -o PROTOCOL/zero_WAY.mcap, ended in five ways: its end, Ctrl-C, zero by the operator, "
@@ -267,7 +267,7 @@ ROWS = (
         "what heats a coil or holds a robot after the run is not under control",
         _zero,
     ),
-    Row(
+    ProtocolRow(
         *("mission", "time to the goal, of the planned time", "%"),
         "A robot at its start, the pump on.",
         "flowrec record CONFIG -o PROTOCOL/mission.mcap",
@@ -275,7 +275,7 @@ ROWS = (
         "a robot that takes longer meets another flow than that of the map",
         _mission,
     ),
-    Row(
+    ProtocolRow(
         *("replay", "sessions that are damaged or replay otherwise", "sessions"),
         "Nothing.",
         "flowrec check PROTOCOL/mission.mcap, then flowrec replay PROTOCOL/mission.mcap --verify",

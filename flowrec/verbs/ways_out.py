@@ -81,14 +81,14 @@ def zero_on_ways(day: Day) -> tuple[float, float, str]:
     """
     shares, told = [], []
     for way in WAYS:
-        limit_s, given = way.limit_s(day.config), day.hand.known(f"zero_{way.name}_s")
-        took_s = _flown(day, way, limit_s) if given is None else given
+        limit_s, given = way.limit_s(day.config), day.hand.number(f"zero_{way.name}_s")
+        took_s = _time_of(day, way, limit_s) if given is None else given
         shares.append(took_s / limit_s)
         told.append(f"{way.text} {took_s:.2f} s of {limit_s:.2g}")
     return 100.0 * max(shares), 100.0, ", ".join(told)
 
 
-def _flown(day: Day, way: Way, limit_s: float) -> float:
+def _time_of(day: Day, way: Way, limit_s: float) -> float:
     """Record until there is a field, leave, and see when the coils are off."""
     if not day.hand.sees_zero:
         raise RigError(f"nobody looks at an ammeter; measure each way, then --answer zero_{way.name}_s=SECONDS")

@@ -20,7 +20,7 @@ from flowrec.store.session import Session
 from flowrec.verbs import protocol, ways_out
 from flowrec.verbs.protocol import FAILED, NOT_DONE, PASSED, RESULTS, DayProtocol, walk
 from flowrec.verbs.protocol_hands import Answers, EmulatedHand
-from flowrec.verbs.protocol_rows import ROWS, Measured
+from flowrec.verbs.protocol_rows import ROWS, RowValue
 from tests.conftest import needs_quiet, run
 from tests.short_missions import SMALL
 from tests.twins.lab import PATIENT
@@ -42,7 +42,7 @@ def results(done: DayProtocol) -> dict[str, str]:
 def rows_with(monkeypatch: pytest.MonkeyPatch, **measures: Any) -> None:
     """The table, with other measurements of some rows; those of the others are not to be made."""
 
-    def none(_day: object) -> Measured:
+    def none(_day: object) -> RowValue:
         raise FlowrecError("not of this test")
 
     rows = tuple(row._replace(measure=measures.get(row.name, none)) for row in ROWS)
@@ -83,15 +83,15 @@ def test_it_goes_on_where_it_was_interrupted_and_measures_again_what_failed(
 ) -> None:
     calls: list[str] = []
 
-    def scale(_day: object) -> Measured:
+    def scale(_day: object) -> RowValue:
         calls.append("scale")
-        return Measured(0.5, 1.0, "")
+        return RowValue(0.5, 1.0, "")
 
-    def axes(_day: object) -> Measured:
+    def axes(_day: object) -> RowValue:
         calls.append("axes")
         if calls.count("axes") == 1:
             raise KeyboardInterrupt
-        return Measured(9.0, 5.0, "")
+        return RowValue(9.0, 5.0, "")
 
     rows_with(monkeypatch, scale=scale, axes=axes)
     config, hand = load_config(None, SMALL), Answers([MOUNTED])
@@ -112,7 +112,7 @@ def test_it_goes_on_where_it_was_interrupted_and_measures_again_what_failed(
 def test_a_line_of_the_results_that_was_cut_off_is_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows_with(monkeypatch, scale=lambda _day: Measured(0.5, 1.0, ""))
+    rows_with(monkeypatch, scale=lambda _day: RowValue(0.5, 1.0, ""))
     config, hand = load_config(None, SMALL), Answers([MOUNTED])
     walk(config, None, {}, tmp_path, hand, ["scale"])
     kept = tmp_path / RESULTS

@@ -19,7 +19,7 @@ _TAIL = 100_000  # of the newest samples, which are seconds of a field that turn
 
 
 class EmulatedInstruments:
-    """What a person reads from emulated devices, and does to them.
+    """Readings that a person takes at emulated devices, and the cable that a person pulls.
 
     Parameters
     ----------
