@@ -1,4 +1,4 @@
-"""Who mounts, reads instruments and pulls cables while `flowrec doctor --protocol` runs: a person, answers, a twin."""
+"""Hands of `flowrec doctor --protocol`, which mount, read instruments and pull cables: of a person, answers, a twin."""
 
 from __future__ import annotations
 
