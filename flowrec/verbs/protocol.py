@@ -147,7 +147,7 @@ class Day:
             process = self.start(path, *sets)
             try:
                 said = process.communicate()[1].decode(errors="replace").strip().splitlines()
-            except KeyboardInterrupt:
+            except BaseException:  # Ctrl-C, or a signal that ends this process
                 process.send_signal(signal.SIGINT)  # in a session of its own, it has not seen Ctrl-C
                 process.communicate()
                 raise
