@@ -10,19 +10,17 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import signal
-import subprocess
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flowrec.core import FlowrecError, UsageError, append_line, say, start_child, table
-from flowrec.physics import load_chip
-from flowrec.stages import Config, ResolvedConfig, resolve, to_toml
+from flowrec.core import FlowrecError, UsageError, append_line, say, table
+from flowrec.stages import Config, ResolvedConfig, to_toml
 from flowrec.store import Session
-from flowrec.verbs.protocol_hands import Hand, free_path
+from flowrec.verbs.protocol_day import Day
+from flowrec.verbs.protocol_hands import Hand
 from flowrec.verbs.protocol_rows import ROWS, ProtocolRow
 
 PASSED, FAILED, NOT_DONE = "pass", "fail", "not done"
@@ -102,63 +100,6 @@ class DayProtocol(NamedTuple):
         return list(zip(ROWS, self.results, strict=True))
 
 
-class Day:
-    """Configuration, files and hands with which the rows measure.
-
-    Parameters
-    ----------
-    asked : the configuration; `file` and `sets` are what it was made of.
-    folder : for the sessions.
-
-    Attributes
-    ----------
-    config : resolved on its chip.
-    """
-
-    def __init__(self, asked: Config, file: Path | None, sets: Mapping[str, Any], folder: Path, hand: Hand) -> None:
-        self.asked, self.folder = asked, folder
-        self.hand: Hand = hand
-        self.config: ResolvedConfig = resolve(asked, load_chip(asked.chip))
-        self.sessions: dict[str, Path] = {}  # by name of the run
-        given = (f"{key}={json.dumps(value)}" for key, value in sets.items())
-        self._words = [*([str(file)] if file is not None else []), *_as_options(given)]
-
-    def new_path(self, name: str) -> Path:
-        """A name for a session that no file has."""
-        return free_path(self.folder, name, ".mcap")
-
-    def start(self, session: Path, *sets: str) -> subprocess.Popen[bytes]:
-        """Start `flowrec record` in a process of its own, as a person in another terminal would."""
-        words = ["record", *self._words, "--out", str(session), *_as_options(sets)]
-        say(f"  flowrec {' '.join(words)}")
-        return start_child(
-            "flowrec", *words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-        )
-
-    def run(self, name: str, *sets: str) -> Session:
-        """The session of a run, which is recorded once.
-
-        Raises
-        ------
-        FlowrecError : it was refused; what the recorder said.
-        """
-        if name not in self.sessions:
-            path = self.new_path(name)
-            process = self.start(path, *sets)
-            try:
-                said = process.communicate()[1].decode(errors="replace").strip().splitlines()
-            except BaseException:  # Ctrl-C, or a signal that ends this process
-                process.send_signal(signal.SIGINT)  # in a session of its own, it has not seen Ctrl-C
-                process.communicate()
-                raise
-            if not path.exists():
-                raise FlowrecError(
-                    f"flowrec record: {said[-1].removeprefix('flowrec: ') if said else 'it says nothing'}"
-                )
-            self.sessions[name] = path
-        return Session(self.sessions[name])
-
-
 def walk(
     asked: Config, file: Path | None, sets: Mapping[str, Any], folder: Path, hand: Hand, only: Iterable[str] = ()
 ) -> DayProtocol:
@@ -207,7 +148,7 @@ def walk(
 
 def _measure(row: ProtocolRow, day: Day) -> RowResult:
     """Measure a row; what stands against it is the text of one that is not done."""
-    if not day.hand.ready(row):
+    if not day.hand.ready(row.what, row.mount):
         return RowResult(row.name, NOT_DONE, text="nobody has mounted it: --answer mounted=yes, or a terminal")
     say(f"{row.name}: {row.what}")
     now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -248,10 +189,6 @@ def _line(row: ProtocolRow, found: RowResult) -> str:
 
 def _amount(value: float | None, unit: str) -> str:
     return "" if value is None else f"{value:.3g} {unit}"
-
-
-def _as_options(sets: Iterable[str]) -> list[str]:
-    return [word for each in sets for word in ("--set", each)]
 
 
 def _plain(value: float | None) -> float | None:

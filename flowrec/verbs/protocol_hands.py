@@ -11,7 +11,6 @@ from flowrec.core import UsageError, say
 
 if TYPE_CHECKING:
     from flowrec.rigs import EmulatedInstruments
-    from flowrec.verbs.protocol_rows import ProtocolRow
 
 MOUNTED = "mounted"  # the answer by which nobody is asked
 
@@ -21,8 +20,8 @@ class Hand(Protocol):
 
     sees_zero: bool
 
-    def ready(self, row: ProtocolRow) -> bool:
-        """Have a row mounted; False: it is left out."""
+    def ready(self, what: str, mount: str) -> bool:
+        """Have it mounted; False: the row is left out."""
 
     def read(self, key: str, question: str) -> str:
         """The answer to a question; '': there is none."""
@@ -50,7 +49,7 @@ class Answers:
                 raise UsageError(f"--answer {text!r}: expected key=value, as in --answer mounted=yes")
             self._given[key.strip()] = value.strip()
 
-    def ready(self, row: ProtocolRow) -> bool:
+    def ready(self, what: str, mount: str) -> bool:
         return self._given.get(MOUNTED) == "yes"
 
     def read(self, key: str, question: str) -> str:
@@ -75,9 +74,9 @@ class Person(Answers):
 
     sees_zero = True
 
-    def ready(self, row: ProtocolRow) -> bool:
-        say(f"{row.what}: {row.mount}")
-        return super().ready(row) or _ask("Enter when it is ready, s to leave it out: ") != "s"
+    def ready(self, what: str, mount: str) -> bool:
+        say(f"{what}: {mount}")
+        return super().ready(what, mount) or _ask("Enter when it is ready, s to leave it out: ") != "s"
 
     def read(self, key: str, question: str) -> str:
         return super().read(key, question) or _ask(f"{question}: ")
