@@ -33,6 +33,8 @@ from flowrec.measure.motion_fit import (
 from flowrec.measure.motion_regression import Turns
 from flowrec.measure.motion_search import SearchRange
 from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outputs
+from flowrec.measure.speed_table import fit_speed_table, proportional_log, propose_table
+from flowrec.physics import Robot
 from flowrec.stages import LAB, MOVIE, FieldCommand, FieldLog, FieldState, Floats, field_motion, read_coil_log
 from flowrec.store import Session, files_behind
 
@@ -53,7 +55,7 @@ class MotionCalibration(NamedTuple):
     fit: MotionFit
     log: str  # what the motion was compared with
     shared_clock: bool  # of the log and the session
-    sets: dict[str, float | bool]  # settings by key
+    sets: dict[str, Any]  # settings by key
     advice: tuple[str, ...]
     covered: Coverage  # images in which the robot was seen, of all
     path: Path  # of the session
@@ -109,17 +111,20 @@ def calibrate_motion(
     positions = np.array([track.position_um for track in tracks]).reshape(-1, 2)
     # The flow that was assumed: that of a refinement has seen the um per revolution of the settings.
     flow = session.fields.get("assumed")
-    imported = session.config.rig == MOVIE
+    imported, robot = session.config.rig == MOVIE, session.config.robot
     if coils is not None:
         log = read_coil_log(coils, session.config.movie.columns, session.config.coils)
-        fit, name = fit_log(stamps_ns, positions, log, ANYWHERE, flow), coils.name
+        turned = _turns_of(log)
+        fit, name = fit_log(stamps_ns, positions, proportional_log(log, robot), ANYWHERE, flow), coils.name
     elif imported:
-        turns, span_s = _applied_turns(session)
+        turned = _applied_turns(session)[0]
+        turns, span_s = _applied_turns(session, robot)
         fit = fit_motion(stamps_ns / NS_PER_S, positions, turns, span_s, _ONE_CLOCK, flow)
         name = "the session's log"
     else:
         log = commanded_field(list(session.messages("currents")))
-        fit = fit_log(stamps_ns, positions, log, _ONE_CLOCK, flow, exact_log=True, own_log=True)
+        turned, as_moved = _turns_of(log), proportional_log(log, robot)
+        fit = fit_log(stamps_ns, positions, as_moved, _ONE_CLOCK, flow, exact_log=True, own_log=True)
         name = "the session's commands"
     if fit.refusal:
         raise UsageError(f"{path}: {fit.refusal}")
@@ -133,6 +138,8 @@ def calibrate_motion(
     if shared and session.config.rig == LAB:
         camera_delay = _camera_delay(session, stamps_ns / NS_PER_S, positions, flow)
     sets, advice = _propose_settings(fit, session, shared_clock=shared, own_log=coils is None)
+    table_found = fit_speed_table(stamps_ns / NS_PER_S, positions, turned, fit, flow)
+    advice = (*propose_table(table_found, robot, sets), *advice)
     if camera_delay is not None and camera_delay[1] < _POOR_OFFSET_S:
         sets["lab.camera_delay_s"] = round(max(camera_delay[0], 0.0), 4)
     covered = Coverage(len(tracks), len(every), "images", "show the robot")
@@ -151,7 +158,7 @@ def _camera_delay(
     The amplifier reports when the field turned, on the host's clock. An image shows the robot as it rolled with the
     field; that its stamp is later is the camera's delay, beyond what the stamps had been corrected by.
     """
-    turns, span_s = _applied_turns(session)
+    turns, span_s = _applied_turns(session, session.config.robot)
     fit = fit_motion(times_s, positions_um, turns, span_s, _ONE_CLOCK, flow, exact_log=True, own_log=True)
     return None if fit.refusal else (session.config.lab.camera_delay_s - fit.offset_s, fit.offset_std_s)
 
@@ -236,9 +243,20 @@ def _means(stamps_ns: Ints, positions_um: Floats, window: int) -> tuple[Ints, Fl
     return means_ns, np.asarray(places[whole].mean(axis=1)), around_ns.astype(np.float64)
 
 
-def _applied_turns(session: Session) -> tuple[Turns, tuple[float, float]]:
-    """The turns from image to image that an imported session holds, and their span in s."""
+def _turns_of(log: FieldLog) -> Turns:
+    """The turns of a log by its times in s."""
+    return lambda time_s: log.turns_until(time_s * NS_PER_S)
+
+
+def _applied_turns(session: Session, robot: Robot | None = None) -> tuple[Turns, tuple[float, float]]:
+    """The turns from image to image that an imported session holds, and their span in s.
+
+    With a robot they are those that its `proportional` would have taken as far, see physics/robot.py.
+    """
     applied = list(session.messages("applied"))
+    if robot is not None:
+        before = [None, *applied[:-1]]
+        applied = [robot.proportional_turns(*pair) for pair in zip(before, applied, strict=True)]
     stamps_s = np.array([each.stamp_ns for each in applied]) / NS_PER_S
     total = np.cumsum([each.turns for each in applied], axis=0)
 
@@ -286,10 +304,10 @@ def _is_turned(fit: MotionFit) -> bool:
 
 def _propose_settings(
     fit: MotionFit, session: Session, *, shared_clock: bool, own_log: bool
-) -> tuple[dict[str, float | bool], tuple[str, ...]]:
+) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Settings, and sentences on what the fit says of the present ones."""
     config, advice = session.config, []
-    sets: dict[str, float | bool] = {"robot.um_per_rev": float(f"{fit.um_per_rev:.4g}")}
+    sets: dict[str, Any] = {"robot.um_per_rev": float(f"{fit.um_per_rev:.4g}")}
     stated = config.robot.um_per_rev
     if abs(fit.um_per_rev - stated) > Z95 * fit.um_per_rev_std:
         advice.append(

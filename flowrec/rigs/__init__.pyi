@@ -1,5 +1,6 @@
 from .emulated.camera import EmulatedCamera as EmulatedCamera
 from .emulated.coils import compiled_firmware as compiled_firmware, emulated_board as emulated_board
+from .emulated.instruments import EmulatedInstruments as EmulatedInstruments
 from .emulated.world import emulated_world as emulated_world
 from .lab.amplifiers.limits import CommandLimits as CommandLimits
 from .lab.cameras.camera import CameraInfo as CameraInfo, Grabbed as Grabbed, Wanted as Wanted, bits_of as bits_of

@@ -164,12 +164,16 @@ class SerialPort:
 
 @dataclass(frozen=True, slots=True)
 class NiOutputs:
-    """Section [lab.ni]: the analog outputs of the amplifier `ni`."""
+    """Section [lab.ni]: the analog outputs of the amplifier `ni`, and inputs that measure what it does."""
 
     # outputs of the coils x, y, z: 'cDAQ1Mod1/ao0:2'. The guardian resets their device when it starts and when it acts,
     # which aborts every other task on it.
     channels: str = ""
     server: str = ""  # host:port of an NI gRPC Device Server; '': the driver of this computer
+    # inputs that measure the currents, one a coil, in the order of the outputs: 'cDAQ1Mod2/ai0:2'; '': none does
+    inputs: str = ""
+    # volts at an input for one ampere of its coil: one number for all coils, or a list with one for each
+    volts_per_a: Annotated[float | tuple[float, ...], Range(1e-6, 1e6)] = 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,17 +2,18 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import typer
 
 from flowrec.core import UsageError
-from flowrec.verbs.command import verb
-from flowrec.verbs.options import Sets, readable_toml
+from flowrec.verbs.command import MisuseError, verb
+from flowrec.verbs.options import AS_THE_COMMAND, Sets, readable_toml
 
 if TYPE_CHECKING:
     from flowrec.stages import Config
     from flowrec.verbs.diagnosis import Finding
+    from flowrec.verbs.protocol import DayProtocol
 
 
 class Diagnosis:
@@ -47,7 +48,7 @@ class Diagnosis:
         return {"level": self.level, "findings": [one._asdict() for one in self.findings]}
 
 
-@verb("flowrec doctor lab.toml")
+@verb("flowrec doctor lab.toml", "flowrec doctor lab.toml --protocol --folder first_day")
 def doctor(
     config: Annotated[
         Path | None, typer.Argument(callback=readable_toml, help="Configuration (TOML) of the lab; else flowrec.toml.")
@@ -57,8 +58,32 @@ def doctor(
     folder: Annotated[
         Path | None, typer.Option(help="Where sessions are written; by default the present folder.")
     ] = None,
-) -> Diagnosis:
+    protocol: Annotated[
+        bool,
+        typer.Option(
+            "--protocol",
+            help="Measure, in order, what a lab's first day has to show. Makes fields; goes on where it was left.",
+        ),
+    ] = False,
+    answers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--answer",
+            metavar="KEY=VALUE",
+            help="With --protocol, instead of a question: mounted=yes, field_table=FILE, zero_kill_s=0.2.",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ROW", help="With --protocol: this measurement alone, also again; may be repeated."),
+    ] = None,
+    at_terminal: Annotated[bool, AS_THE_COMMAND] = False,
+) -> "Union[Diagnosis, DayProtocol]":  # noqa: UP007 - as text
     """Look at camera, coils, disk and viewer before a run: what is ready, and what to do about the rest.
+
+    Parameters
+    ----------
+    at_terminal : a person may be asked; False: only answers count.
 
     Raises
     ------
@@ -66,6 +91,16 @@ def doctor(
     """
     from flowrec.core import settings_of
     from flowrec.stages import load_config
+
+    if not protocol and (answers or only):
+        raise MisuseError("--answer and --only are for --protocol")
+    if protocol:
+        from flowrec.verbs.protocol import walk
+        from flowrec.verbs.protocol_hands import hand_of
+
+        given = settings_of(sets or ()) | ({"rig": rig} if rig is not None else {})
+        hand = hand_of(answers or (), asks=at_terminal)
+        return walk(load_config(config, given, {"rig": "--rig"}), config, given, folder or Path(), hand, only or ())
     from flowrec.verbs.diagnosis import diagnose, of_devices
 
     settings = settings_of(sets or ()) | ({"rig": rig} if rig is not None else {})

@@ -3,7 +3,7 @@
 import signal
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Union
 
 import typer
 
@@ -13,6 +13,7 @@ from flowrec.verbs.options import Overwrite, Sets, WholeDescriptions
 
 if TYPE_CHECKING:
     from flowrec.verbs.emulated_lab import EmulatedLab
+    from flowrec.verbs.protocol import DayProtocol
 
 _SLICE_S = 0.5  # of the wait for Ctrl-C
 
@@ -28,13 +29,17 @@ class Flown:
     def __init__(self, session: Path | None = None, exit_status: int = 0, latency: str = "") -> None:
         self.session, self.exit_status, self._latency = session, exit_status, latency
 
+    def as_json(self) -> dict[str, str | None]:
+        """For JSON."""
+        return {"session": str(self.session) if self.session else None, "latency": self._latency}
+
     def show(self) -> None:
         """Print the chain of latency."""
         if self._latency:
             say(f"latency, median and (95 %): {self._latency}")
 
 
-@verb("flowrec emulate lab", "flowrec emulate lab --fly a.mcap", with_json=False)
+@verb("flowrec emulate lab", "flowrec emulate lab --fly a.mcap", "flowrec emulate lab --protocol first_day")
 def lab(
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="TOML", help="Configuration of the devices, removed at the end.")
@@ -47,8 +52,19 @@ def lab(
         typer.Option(metavar="MS", min=0.0, max=500.0, help="Time from the end of an exposure to its image."),
     ] = 12.0,
     sets: Sets = None,
+    world: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=VALUE", help="Change a setting of the world alone: a defect that is to be found."),
+    ] = None,
+    protocol: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Run the protocol of flowrec doctor on them, and end them after it."),
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="ROW", help="With --protocol: this measurement alone.")
+    ] = None,
     overwrite: Overwrite = False,
-) -> Flown:
+) -> "Union[Flown, DayProtocol]":  # noqa: UP007 - as text
     """Emulate the devices of a lab and a robot in flow between them; flowrec record runs on them as on yours.
 
     The camera is a stream of images on the loopback. The amplifier is the firmware, compiled, behind a pseudo terminal.
@@ -65,7 +81,14 @@ def lab(
 
     if fly is not None:  # before a compilation
         Output(fly, MCAP, (), overwrite).check()
-    with emulated_lab(out, 1e-3 * camera_delay_ms, sets or (), overwrite) as made:
+    with emulated_lab(out, 1e-3 * camera_delay_ms, sets or (), overwrite, world or ()) as made:
+        if protocol is not None:
+            from flowrec.stages import load_config
+            from flowrec.verbs.protocol import walk
+            from flowrec.verbs.protocol_hands import EmulatedHand
+
+            hand = EmulatedHand(made.instruments, protocol)
+            return walk(load_config(made.file), made.file, {}, protocol, hand, only or ())
         if fly is not None:
             return _fly(made, fly, overwrite)
         say(f"camera at {made.camera}, amplifier at {made.port}; {made.file} has the settings that use them")

@@ -12,7 +12,7 @@ from typing import Any
 from flowrec.core import TOML, Output, say, settings_of
 from flowrec.measure import as_toml
 from flowrec.physics import load_chip
-from flowrec.rigs import EmulatedCamera, compiled_firmware, emulated_board, emulated_world
+from flowrec.rigs import EmulatedCamera, EmulatedInstruments, compiled_firmware, emulated_board, emulated_world
 from flowrec.stages import assemble, load_config, resolve
 
 # A small, slow lab, which a busy computer with two cores holds. What differs from the truth stays to be found.
@@ -44,23 +44,31 @@ class EmulatedLab:
     ----------
     file : the configuration that uses them.
     camera, port : where they are.
+    instruments : what a person would hold to them, and do to them.
     """
 
     file: Path
     camera: str
     port: str
+    instruments: EmulatedInstruments
 
 
 @contextmanager
 def emulated_lab(
-    file: Path, camera_delay_s: float, sets: Iterable[str] | Mapping[str, Any], overwrite: bool = False
+    file: Path,
+    camera_delay_s: float,
+    sets: Iterable[str] | Mapping[str, Any],
+    overwrite: bool = False,
+    world: Iterable[str] | Mapping[str, Any] = (),
 ) -> Iterator[EmulatedLab]:
     """Camera, amplifier and world on this computer while the context lasts; `file` is written, and removed at the end.
 
     Parameters
     ----------
     camera_delay_s : from the end of an exposure until its image is sent.
-    sets : settings that differ from those of the emulated lab; of its world (simulated.*) and the recorder's too.
+    sets : settings that differ from those of the emulated lab, of its world and of the recorder; simulated.* are of the
+        world alone.
+    world : settings of the world that the configuration states otherwise: defects to be found.
 
     Raises
     ------
@@ -69,7 +77,7 @@ def emulated_lab(
     output = Output(file, TOML, (), overwrite)
     output.check()
     given = _SETTINGS | settings_of(sets)
-    config = load_config(None, given)
+    config = load_config(None, given | settings_of(world))
     chip = load_chip(config.chip)
     resolved = resolve(config, chip)
     pipeline = assemble(resolved, chip)
@@ -84,10 +92,13 @@ def emulated_lab(
         ):
             devices = {"lab.camera": "opencv", "lab.device": images.url}
             devices |= {"lab.amplifier": "serial", "lab.serial.port": board.port}
-            settings = dict(sorted((given | devices).items()))
+            of_recorder = {key: value for key, value in given.items() if not key.startswith("simulated.")}
+            settings = dict(sorted((of_recorder | devices).items()))
             with output.new_file() as part:
                 part.write_text('rig = "lab"\n' + as_toml(("Devices that flowrec emulate lab runs.",), settings))
             try:
-                yield EmulatedLab(file, images.url, board.port)
+                yield EmulatedLab(
+                    file, images.url, board.port, EmulatedInstruments(board.samples, images, resolved.coils)
+                )
             finally:
                 file.unlink(missing_ok=True)

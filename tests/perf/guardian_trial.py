@@ -22,7 +22,7 @@ from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.stages.control.coils import Coils
 from flowrec.stages.rig_settings import OutputLimits
-from tests.twins.coils import channels
+from tests.twins.coils import channels, sense_channels
 
 COILS = Coils(bias_mt=(0.05, 0.0, -0.04))
 # Three pairs that are not quite alike. At 2.1 A currents of least norm make 3.73 mT in any direction; 4 are possible.
@@ -41,8 +41,10 @@ def coils_of(count: int) -> Coils:
     return COILS if count == COILS.count else SIX_COILS
 
 
-def amplifier(kind: str, address: str, silence_s: float = 0.1, coils: Coils = COILS) -> Amplifier:
-    """The amplifier of a twin."""
+def amplifier(
+    kind: str, address: str, silence_s: float = 0.1, coils: Coils = COILS, *, sensors: bool = False
+) -> Amplifier:
+    """The amplifier of a twin; with `sensors` the inputs of an NI twin are read, too."""
     if kind == "serial":
         from flowrec.rigs.lab.amplifiers.serial_line import SerialAmplifier
 
@@ -50,7 +52,8 @@ def amplifier(kind: str, address: str, silence_s: float = 0.1, coils: Coils = CO
     from flowrec.rigs.lab.amplifiers.ni import NiAmplifier
     from flowrec.rigs.lab.amplifiers.ni_process import NiSettings
 
-    return NiAmplifier(NiSettings(channels(coils.count), address, coils, ROBOT, OUTPUT, silence_s))
+    inputs = sense_channels(coils.count) if sensors else ""
+    return NiAmplifier(NiSettings(channels(coils.count), address, coils, ROBOT, OUTPUT, silence_s, inputs))
 
 
 def currents(frequency_hz: float, heading_rad: float, amplitude_mt: float = 4.0) -> Currents:

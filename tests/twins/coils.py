@@ -63,7 +63,8 @@ def _programs() -> TemporaryDirectory[str]:
 @contextmanager
 def device(kind: str, folder: Path, timer_ms: int = 100, coils: int = 3) -> Iterator[Device]:
     """`serial`: the firmware's own timer is off, so that the guardian is alone; `serial+timer`; `ni`. `serial+sensors`
-    measures its currents; while there is a file `fault` in the folder, its first coil has half of its current.
+    measures its currents, and so does `ni` where inputs are asked for; while there is a file `fault` in the folder, the
+    first coil has half of its current.
 
     `folder` gets the file of the outputs.
     """
@@ -77,7 +78,8 @@ def device(kind: str, folder: Path, timer_ms: int = 100, coils: int = 3) -> Iter
         return
     command = [sys.executable, "-m", "tests.twins.ni", file, str(coils)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen(command, **pipes, text=True, cwd=_ROOT, env=environment()) as server:
+    env = environment(TWIN_FAULT=str(folder / "fault"))
+    with subprocess.Popen(command, **pipes, text=True, cwd=_ROOT, env=env) as server:
         try:
             assert server.stdout is not None
             yield Device(file, 1.0, coils, "ni", f"127.0.0.1:{server.stdout.readline().strip()}")
@@ -88,6 +90,11 @@ def device(kind: str, folder: Path, timer_ms: int = 100, coils: int = 3) -> Iter
 def channels(coils: int) -> str:
     """Outputs of the NI twin for so many coils."""
     return f"cDAQ1Mod1/ao0:{coils - 1}"
+
+
+def sense_channels(coils: int) -> str:
+    """Inputs of the NI twin that measure the currents of so many coils."""
+    return f"cDAQ1Mod2/ai0:{coils - 1}"
 
 
 def environment(**more: str) -> dict[str, str]:

@@ -7,10 +7,13 @@ that hold their last value when a task stops, runs dry, or its client dies. FILE
 of as many coils as are said,
 with the time at which it is put out. A third argument makes the product type of the reset that leaves the outputs as
 they are, as S Series does.
+Inputs of a second module of the chassis read the voltage of the output of the same number, as a sensor of 1 V/A behind
+an amplifier of 1 A/V; while there is a file TWIN_FAULT, the first one reads half.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import threading
@@ -30,6 +33,7 @@ from flowrec.core.system.processes import Priority, prioritise_process
 from flowrec.rigs.emulated.coils import sample
 
 DEVICE, RANGE_V, MAX_RATE_HZ = "cDAQ1Mod1", 10.0, 100_000.0
+SENSORS = "cDAQ1Mod2"
 _STEP_S = 0.001
 _REGENERATE = 10097
 _TYPES = {0x631: "NI 9263", 0x632: 0x1D2C3B4A}  # attributes of a device: product type, serial number
@@ -45,6 +49,7 @@ class Task:
     """A task on the server."""
 
     channels: list[int] = field(default_factory=list)
+    inputs: list[int] = field(default_factory=list)
     low: float = -RANGE_V
     high: float = RANGE_V
     rate: float = 0.0
@@ -162,6 +167,19 @@ class NiTwin(rpc.NiDAQmxServicer):
             raise NiError(-200077)
         task.low, task.high = request.min_val, request.max_val
 
+    def on_CreateAIVoltageChan(self, request: Any) -> None:  # noqa: N802
+        found = re.fullmatch(rf"{SENSORS}/ai(\d+)(?::(?:ai)?(\d+))?", request.physical_channel)
+        if found is None or int(found[2] or found[1]) > self._coils:
+            raise NiError(-200170)
+        self.task(request).inputs += range(int(found[1]), int(found[2] or found[1]) + 1)
+
+    def on_ReadAnalogF64(self, request: Any) -> dict[str, Any]:  # noqa: N802
+        task = self.task(request)
+        volts = self.outputs[task.inputs]
+        if 0 in task.inputs and Path(os.environ.get("TWIN_FAULT", "")).is_file():
+            volts[task.inputs.index(0)] *= 0.5
+        return {"read_array": volts, "samps_per_chan_read": 1}
+
     def on_CfgSampClkTiming(self, request: Any) -> None:  # noqa: N802
         if request.rate > MAX_RATE_HZ:
             raise NiError(-200077)
@@ -180,7 +198,9 @@ class NiTwin(rpc.NiDAQmxServicer):
         return {"value": self.task(request).rate}
 
     def on_GetTaskAttributeString(self, request: Any) -> dict[str, Any]:  # noqa: N802
-        return {"value": ", ".join(f"{DEVICE}/ao{n}" for n in self.task(request).channels)}
+        task = self.task(request)
+        names = [*(f"{DEVICE}/ao{n}" for n in task.channels), *(f"{SENSORS}/ai{n}" for n in task.inputs)]
+        return {"value": ", ".join(names)}
 
     def on_GetTaskAttributeUInt32(self, request: Any) -> dict[str, Any]:  # noqa: N802
         return {"value": len(self.task(request).channels)}

@@ -28,6 +28,7 @@ class EmulatedCamera:
     ----------
     url : where a client finds it.
     dropped : images that slow clients did not get.
+    plugged : False: its cable is pulled, and no image leaves it.
     """
 
     def __init__(self, width_px: int, height_px: int, rate_hz: float) -> None:
@@ -35,6 +36,7 @@ class EmulatedCamera:
         self._head = f"YUV4MPEG2 W{width_px} H{height_px} F{rate} Ip A1:1 Cmono XCOLORRANGE=FULL\n".encode()
         self._bytes = width_px * height_px
         self.dropped = 0
+        self.plugged = True
         self._server = socket.create_server(("127.0.0.1", 0))
         self.url = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
         self._clients: list[_Client] = []
@@ -54,6 +56,8 @@ class EmulatedCamera:
 
     def __call__(self, image: Image) -> None:
         """Send an image to every client."""
+        if not self.plugged:
+            return
         data = b"FRAME\n" + image.tobytes()
         for client in list(self._clients):
             if not client.alive:

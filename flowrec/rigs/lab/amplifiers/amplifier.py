@@ -31,7 +31,7 @@ class AmplifierInfo:
     max_output_hz : highest rate of its output samples.
     latency_s : from `apply` to the output, as configured; the field log holds what was measured.
     timer_s : silence after which the device itself goes to zero; 0: it holds its last output for ever.
-    measures : it measures the currents, and has a method `measured() -> Measured | None`: the latest measurement, with
+    measures : it measures the currents, and has a method `read_back() -> Measured | None`: the latest measurement, with
         its stamp on the host's monotonic clock; None: there is none yet.
     """
 

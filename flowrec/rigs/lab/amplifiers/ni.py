@@ -15,7 +15,7 @@ import nidaqmx  # noqa: F401  here, so that a missing package is stated before a
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, RigError, start_child
+from flowrec.core import NS_PER_S, Measured, RigError, start_child
 from flowrec.physics import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import KEEP_S, AmplifierInfo, not_before
 from flowrec.stages import Coils, FieldCommand, FieldLog, MotionSegment, OutputLimits
@@ -31,7 +31,7 @@ _END_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class NiSettings:
-    """Settings of the process."""
+    """Settings of the process; `inputs` and `volts_per_a` as of [lab.ni]."""
 
     channels: str
     server: str
@@ -39,6 +39,8 @@ class NiSettings:
     robot: Robot
     output: OutputLimits
     silence_s: float
+    inputs: str = ""
+    volts_per_a: float | tuple[float, ...] = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +64,9 @@ class NiAmplifier:
     @classmethod
     def of(cls, config: ResolvedConfig) -> Self:
         """The amplifier of a configuration."""
-        lab = config.lab
-        return cls(NiSettings(lab.ni.channels, lab.ni.server, config.coils, config.robot, lab.output, lab.guardian_s))
+        lab, ni = config.lab, config.lab.ni
+        of_run = (config.coils, config.robot, lab.output, lab.guardian_s)
+        return cls(NiSettings(ni.channels, ni.server, *of_run, ni.inputs, ni.volts_per_a))
 
     def __init__(self, settings: NiSettings) -> None:
         self.underruns = 0
@@ -73,6 +76,7 @@ class NiAmplifier:
         self._zero_pipe = self._done_pipe = -1
         self._permitted = False
         self._fault = ""
+        self._read_back: Measured | None = None
         self._played_s = 0.0
         self._played: deque[Played] = deque()  # blocks whose time has not come
         self._cuts: deque[int] = deque()  # when zero() took the output to zero; any thread appends
@@ -141,6 +145,11 @@ class NiAmplifier:
         self._log.forget(until_ns - round(KEEP_S * NS_PER_S))
         return self._log
 
+    def read_back(self) -> Measured | None:
+        """The latest measurement of the inputs; None: there is none yet."""
+        self._hear()
+        return self._read_back
+
     def zero(self) -> None:
         self._permitted = False
         if self._process is None:
@@ -189,6 +198,8 @@ class NiAmplifier:
         if what == "block":
             self._played.append(given[0])
             self._played_s = time.monotonic()
+        elif what == "measured":
+            self._read_back = given[0]
         elif what == "fault":
             self._fault = given[0]
             self.underruns += "ran dry" in self._fault

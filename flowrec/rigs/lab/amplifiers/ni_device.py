@@ -1,4 +1,4 @@
-"""Analog outputs of an NI device, one a coil, through NI-DAQmx of this computer or an NI gRPC Device Server."""
+"""Analog outputs and inputs of NI devices, one a coil, through NI-DAQmx or an NI gRPC Device Server."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import nidaqmx
 import numpy as np
 from nidaqmx.constants import AcquisitionType, RegenerationMode
 from nidaqmx.errors import DaqError, DaqNotFoundError, DaqNotSupportedError, RpcError
+from nidaqmx.stream_readers import AnalogMultiChannelReader
 from nidaqmx.system import Device
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.stages import AmplifierSettings
 
 _CONNECT_S = 10.0
+_READ_S = 0.1  # for a sample of the inputs
 UNDERFLOWS = (-200290, -200621, -200018, -200016)  # of the buffer in the computer, and of those in devices
 # Codes of NI-DAQmx (NIDAQmx.h).
 _NO_DEVICE, _NO_CHANNEL, _RESERVED = (-200220, -201003), (-200170,), (-50103, -200022)
@@ -157,6 +159,63 @@ class NiDevice:
         return task
 
 
+class NiInputs:
+    """Inputs that read the currents of the coils, one sample of all when it is asked for.
+
+    Parameters
+    ----------
+    channels : as NI-DAQmx names them: 'cDAQ1Mod2/ai0:2'.
+    server : as of NiDevice.
+    volts_per_a : (coils,) or (1,) volts at an input for one ampere of its coil.
+    coils : their number.
+
+    Raises
+    ------
+    RigError : no such inputs, or not one a coil; one line.
+    """
+
+    def __init__(self, channels: str, server: str, volts_per_a: NDArray[np.float64], coils: int) -> None:
+        if volts_per_a.size not in (1, coils):
+            raise RigError(
+                f"lab.ni.volts_per_a: {volts_per_a.size} numbers, where there are {coils} coils; give one number for "
+                "all coils, or one for each"
+            )
+        self._volts_per_a = volts_per_a
+        self._task = nidaqmx.Task(grpc_options=grpc_options(server) if server else None)
+        try:
+            self._task.ai_channels.add_ai_voltage_chan(channels)
+            count = len(self._task.ai_channels.channel_names)
+            if count != coils:
+                raise RigError(f"lab.ni.inputs = {channels!r}: {count} inputs, where {coils} coils need one each")
+            self._count = count
+            self._reader = AnalogMultiChannelReader(self._task.in_stream)
+            self._reader.verify_array_shape = False  # asks the device for what is known here, each time
+            self._task.start()
+        except DaqError as error:
+            self._task.close()
+            raise RigError(f"lab.ni.inputs = {channels!r}: {reason(error)}") from error
+        except BaseException:
+            self._task.close()
+            raise
+
+    def currents_a(self) -> tuple[NDArray[np.float64], int]:
+        """Currents (coils,) now, and when that was, in ns of the host's monotonic clock.
+
+        Raises
+        ------
+        DaqError : the inputs do not answer, or were stopped.
+        """
+        volts = np.zeros(self._count)
+        before_ns = time.monotonic_ns()
+        self._reader.read_one_sample(volts, _READ_S)
+        return volts / self._volts_per_a, (before_ns + time.monotonic_ns()) // 2
+
+    def close(self) -> None:
+        """Release the inputs."""
+        with contextlib.suppress(DaqError):  # a task that has failed
+            self._task.close()
+
+
 def devices(channels: str) -> list[str]:
     """Names of the devices in a list of channels."""
     return sorted({part.strip().partition("/")[0] for part in channels.split(",")})
@@ -206,7 +265,7 @@ def reason(error: Exception) -> str:
         if code in _NO_DEVICE:
             return f"NI knows no such device (error {code}); see NI MAX or nilsdev for its name"
         if code in _NO_CHANNEL:
-            return f"the device has no such output (error {code})"
+            return f"the device has no such channel (error {code})"
         if code in _RESERVED:
             return f"another program uses the outputs (NI error {code}); close it"
         return f"NI error {code}: {_first_line(error)}"

@@ -3,7 +3,7 @@
 It is `python -m flowrec.rigs.lab.amplifiers.ni_process CONNECTION ZERO DONE`, with open descriptors: a connection of
 multiprocessing for orders and reports, a pipe whose bytes ask for zero, and one whose bytes confirm it. The orders are
 ("open", NiSettings), ("arm",) and ("command", FieldCommand); the reports ("info", AmplifierInfo), ("armed",),
-("block", Played) and ("fault", text).
+("block", Played), ("measured", Measured), where there are inputs, and ("fault", text).
 
 Blocks of 50 ms are written two ahead and are not generated again. An output that runs dry, a device that was reset, a
 sample beyond a limit, or no order for `silence_s` while a field is on: all end in zero, and only a new "arm" leads out.
@@ -17,20 +17,37 @@ import select
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
 
-from flowrec.core import NS_PER_S, DeviceClock, Fit, FlowrecError, Priority, RigError, prioritise_process, seconds
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import (
+    NS_PER_S,
+    DeviceClock,
+    Fit,
+    FlowrecError,
+    Measured,
+    Priority,
+    RigError,
+    prioritise_process,
+    seconds,
+)
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.amplifiers.ni import NiSettings, Played
-from flowrec.rigs.lab.amplifiers.ni_device import NiDevice, reason
+from flowrec.rigs.lab.amplifiers.ni_device import NiDevice, NiInputs, reason
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
 from flowrec.stages import FieldCommand
 
 BLOCK_S = 0.05
 BLOCKS_AHEAD = 2  # in the device's buffer: with one, a late block would end the output
 LATENCY_S = (BLOCKS_AHEAD + 0.5) * BLOCK_S  # mean time from an order to its samples
+_READ_S = 0.01  # between measurements of the currents
+_KEPT_BLOCKS = 2 * BLOCKS_AHEAD + 2  # of which a measurement may be
 _REST = FieldCommand()
 
 
@@ -45,6 +62,8 @@ class Stream:
         self._written = 0
         self._clock = DeviceClock(unit=NS_PER_S / self._rate_hz, wrap=1 << 63)
         self._fit: Fit | None = None
+        # First samples, and currents (n, coils), of the latest blocks.
+        self._blocks: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=_KEPT_BLOCKS)
         for _ in range(BLOCKS_AHEAD):
             self._write(_REST)
         self._began_ns = device.run()
@@ -80,8 +99,18 @@ class Stream:
     def _write(self, command: FieldCommand) -> Any:
         block = self._waveform.block(command, self._count)
         self._device.write(block.voltages_v)
+        self._blocks.append((self._written, block.currents_a))
         self._written += self._count
         return block
+
+    def currents_a(self, at_ns: int) -> NDArray[np.float64]:
+        """Currents (coils,) that are put out at a time of the host's monotonic clock."""
+        fit = self._fit
+        period_ns = NS_PER_S / self._rate_hz if fit is None else fit.rate
+        since = (0, self._began_ns) if fit is None else (fit.last[0], fit.stamp_ns)
+        at = since[0] + (at_ns - since[1]) / period_ns
+        first, currents = next((each for each in reversed(self._blocks) if each[0] <= at), self._blocks[0])
+        return currents[int(np.clip(at - first, 0, len(currents) - 1))]
 
     def _stamp_ns(self, sample: int) -> int:
         """Time at which a sample is put out."""
@@ -97,6 +126,8 @@ class Server:
         self._connection, self._zero, self._done = connection, zero, done
         self._settings: NiSettings | None = None
         self._device: NiDevice | None = None
+        self._inputs: NiInputs | None = None
+        self._read_s = 0.0
         self._stream: Stream | None = None
         self._command = _REST
         self._ordered_s = 0.0
@@ -106,6 +137,7 @@ class Server:
         try:
             while True:
                 wait_s = max(self._stream.due_s(), 0.0) if self._stream is not None else None
+                wait_s = min(wait_s, _READ_S) if wait_s is not None and self._inputs is not None else wait_s
                 ready = select.select([self._zero, self._connection.fileno()], [], [], wait_s)[0]
                 if self._zero in ready:
                     os.read(self._zero, 4096)
@@ -115,10 +147,14 @@ class Server:
                     self._take()
                 if self._stream is not None and self._stream.due_s() <= 0.0:
                     self._play()
+                if self._inputs is not None and time.monotonic() - self._read_s >= _READ_S:
+                    self._measure(self._inputs)
         except (EOFError, OSError):  # the recorder is gone
             pass
         finally:
             self._stop()
+            if self._inputs is not None:
+                self._inputs.close()
 
     def _take(self) -> None:
         while self._connection.poll():
@@ -141,13 +177,18 @@ class Server:
         device = NiDevice(settings.channels, settings.server, coils.amplifier, coils.count, LATENCY_S)
         device.take()
         self._device = device  # from now on its outputs are taken to zero at the end, whoever uses them
+        if settings.inputs:
+            _inputs_of(settings).close()  # that they are there; the guardian resets a device that has outputs, too
         prioritise_process(Priority.DEVICE)  # now that the driver has started its threads
-        self._connection.send(("info", self._device.info))
+        self._connection.send(("info", replace(device.info, measures=bool(settings.inputs))))
 
     def _arm(self) -> None:
         assert self._settings is not None and self._device is not None
         s = self._settings
         self._command = _REST
+        if self._inputs is not None:
+            self._inputs.close()
+        self._inputs = _inputs_of(s) if s.inputs else None
         self._stream = Stream(self._device, CommandLimits(s.coils, s.robot, s.output))
         self._connection.send(("armed",))
 
@@ -160,6 +201,20 @@ class Server:
                 raise RigError(f"no order of the loop for {1e3 * self._settings.silence_s:.0f} ms")
             for played in self._stream.refill(self._command):
                 self._connection.send(("block", played))
+        except (BrokenPipeError, ConnectionError):
+            raise
+        except Exception as error:  # noqa: BLE001  whatever a driver raises ends in zero
+            self._fault(error)
+
+    def _measure(self, inputs: NiInputs) -> None:
+        """Read the currents while there is an output; where they are not read, the output goes to zero."""
+        if self._stream is None:
+            return
+        try:
+            currents_a, at_ns = inputs.currents_a()
+            self._read_s = time.monotonic()
+            measured = Measured(at_ns, currents_a, self._stream.currents_a(at_ns))
+            self._connection.send(("measured", measured))
         except (BrokenPipeError, ConnectionError):
             raise
         except Exception as error:  # noqa: BLE001  whatever a driver raises ends in zero
@@ -178,6 +233,11 @@ class Server:
         except Exception as failure:  # noqa: BLE001
             text += f"; zero failed: {reason(failure)}"
         self._connection.send(("fault", text))
+
+
+def _inputs_of(settings: NiSettings) -> NiInputs:
+    volts_per_a = np.atleast_1d(settings.volts_per_a)
+    return NiInputs(settings.inputs, settings.server, volts_per_a, settings.coils.count)
 
 
 assert sys.platform != "win32"  # there is no SIGHUP; NiAmplifier refuses to start this process
