@@ -1,0 +1,100 @@
+"""Several robots that touch or hide each other in an image: all of them are fitted at once.
+
+The light that passes is the product of what each robot lets through,
+
+    I = b prod_k (1 - a_k disc(s_k) + 0.35 a_k rim(s_k)),    s_k = (|p - x_k| - r_k) / e_k,
+
+with disc and rim of disc_fit.py; radius r and darkness a of each are known from when it was alone. The places x are those
+of largest posterior probability, from where each robot is expected with a variance: where one hides another, the image
+says little of their difference, and the expectation decides. Among all ways to exchange the robots that is kept whose
+cost is least, so that their looks tell them apart where their ways do not.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import Floats
+from flowrec.stages.vision.disc_fit import RIM_RATIO, initial_edge_px
+from flowrec.stages.vision.walls import Walls
+
+_STEEPNESS, _RIM_POSITION, _RIM_WIDTH = 2.2, 2.0, 1.1  # as in disc_fit.py
+_ITERATIONS = 6  # of the Gauss-Newton steps
+_PERMUTED = 3  # robots at most whose exchange is tried: six ways
+_MISFIT = 0.1  # of the background: standard deviation of a pixel about the model, whose neighbours err alike
+_ALIKE_PX = 9.0  # pixels that err alike
+_BOX_RADII = 1.8  # around the robots
+_LEVEL = 0.8  # quantile of the grey levels around robots: the background
+_LEAST_LIKENESS = 0.6  # sqrt(1 - residual / variance), below which the image does not show these robots
+
+
+class Body(NamedTuple):
+    """A robot that is expected in an image, in camera px and grey levels."""
+
+    expected_px: Floats  # (2,)
+    variance_px2: float  # of that, per component
+    radius_px: float
+    darkness: float
+
+
+def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodies: list[Body]) -> Floats | None:
+    """Places (n, 2) in px of robots that touch each other; None if the image does not show them."""
+    expected, radii = np.array([body.expected_px for body in bodies]), np.array([body.radius_px for body in bodies])
+    x0, y0 = np.floor((expected - _BOX_RADII * radii[:, None]).min(axis=0)).astype(int)
+    x1, y1 = np.ceil((expected + _BOX_RADII * radii[:, None]).max(axis=0)).astype(int) + 1
+    (left, top), (right, bottom) = np.maximum((x0, y0), 0), np.minimum((x1, y1), image.shape[::-1])
+    if right - left < 3 or bottom - top < 3:
+        return None
+    step = max(1, int(radii.min() / 6.0))
+    rows, columns = np.mgrid[top:bottom:step, left:right:step]
+    free = walls.distance_px[rows, columns] > margin_px
+    pixels = np.column_stack((columns[free], rows[free])).astype(np.float64)
+    grey = image[rows[free], columns[free]].astype(np.float64)
+    if len(grey) < 4 * len(bodies):
+        return None
+    level = max(float(np.quantile(grey, _LEVEL)), 1.0)
+    share = np.clip([body.darkness / level for body in bodies], 0.05, 0.98)
+    weight = step**2 / (_ALIKE_PX * (_MISFIT * level) ** 2)
+    precision = np.array([1.0 / max(body.variance_px2, 1e-6) for body in bodies])
+    orders = itertools.permutations(range(len(bodies))) if len(bodies) <= _PERMUTED else [tuple(range(len(bodies)))]
+    best: tuple[float, Floats, float] | None = None
+    for order in orders:
+        places = expected[list(order)].copy()
+        for _ in range(_ITERATIONS):
+            model, slopes = _light(pixels, places, radii, share)
+            off = grey - level * model
+            jacobian = level * slopes.reshape(len(grey), -1)
+            normal = weight * jacobian.T @ jacobian + np.diag(np.repeat(precision, 2))
+            slope = weight * jacobian.T @ off - (precision[:, None] * (places - expected)).ravel()
+            move = np.linalg.solve(normal, slope).reshape(-1, 2)
+            longest = np.hypot(*move.T) / (0.5 * radii)
+            places += move / np.maximum(longest, 1.0)[:, None]
+        residual = float(((grey - level * _light(pixels, places, radii, share)[0]) ** 2).sum())
+        cost = weight * residual + float((precision[:, None] * (places - expected) ** 2).sum())
+        if best is None or cost < best[0]:
+            best = cost, places, residual
+    assert best is not None
+    variance = float(((grey - level) ** 2).sum())
+    likeness = np.sqrt(max(1.0 - best[2] / max(variance, 1e-9), 0.0))
+    return best[1] if likeness >= _LEAST_LIKENESS and np.isfinite(best[1]).all() else None
+
+
+def _light(pixels: Floats, places: Floats, radii: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Light (m,) that passes, of the background's, and its derivatives (m, n, 2) in the places (n, 2)."""
+    away = pixels[:, None] - places
+    rho = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-6)
+    edges = np.array([initial_edge_px(float(radius)) for radius in radii])
+    s = (rho - radii) / edges
+    disc = 1.0 / (1.0 + np.exp(np.clip(_STEEPNESS * s, -40.0, 40.0)))
+    off = (s - _RIM_POSITION) / _RIM_WIDTH
+    rim = RIM_RATIO * np.exp(-(off**2))
+    passed = 1.0 - share * (disc - rim)
+    by_s = share * (_STEEPNESS * disc * (1.0 - disc) - 2.0 * off / _RIM_WIDTH * rim)
+    light = passed.prod(axis=1)
+    # s falls as the robot comes nearer: ds / dx = -away / (rho e).
+    slopes = (light[:, None] / passed * by_s / (rho * edges))[..., None] * -away
+    return light, slopes
