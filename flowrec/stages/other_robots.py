@@ -34,8 +34,8 @@ from flowrec.stages.estimation import Observer
 from flowrec.stages.robot_topics import estimate_of, messages_of, track_of
 from flowrec.stages.vision import Expected
 
-_OWN_ERROR = 0.15  # standard deviation of a robot's own displacement in a frame, as a ratio
-_STD_RADII = 0.05  # least error of an expected place
+_OWN_ERROR = 0.3  # standard deviation of a robot's own displacement in a frame, as a ratio
+_STD_RADII = 0.12  # least error of an expected place
 _FARTHEST_UM = 1e5  # standard deviation of a place of which nothing is known
 _SEEN_S = 1.0  # a robot that was not seen for longer may be anywhere
 _OVER = 1.2  # of the distance at which an alarm begins: there it ends

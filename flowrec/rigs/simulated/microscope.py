@@ -14,18 +14,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import Image, compiled, pixel_type
+from flowrec.core import Floats, Image, compiled, pixel_type
 from flowrec.physics import Calibration, clearance_um
-from flowrec.rigs.simulated.others import DARKNESS, DrawnRobot
 from flowrec.stages import CameraSettings, Optics, SimulatedImage
 
 _POOL = 1 << 20  # normal numbers drawn once; an image takes its noise from them at random offsets
+_DARKNESS = 0.8  # of the robot of the mission
 _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
 
 
@@ -103,6 +104,15 @@ def _expose(
             out[x] = min(max(grey * scale + half, low), high)
 
 
+class DrawnRobot(NamedTuple):
+    """A robot in an image."""
+
+    position_um: Floats  # (2,)
+    radius_um: float
+    velocity_um_s: Floats  # (2,)
+    darkness: float  # from 0 to 1
+
+
 class Microscope:
     """Renders frames.
 
@@ -175,7 +185,7 @@ class Microscope:
         ]
         robots = [each._replace(position_um=each.position_um + (0.0 if stage_um is None else stage_um)) for each in others]
         if robot_um is not None:
-            robots.append(DrawnRobot(robot_um, robot_radius_um, robot_velocity_um_s, DARKNESS))
+            robots.append(DrawnRobot(robot_um, robot_radius_um, robot_velocity_um_s, _DARKNESS))
         for each in robots:
             place = self._calibration.to_px(each.position_um).tolist()
             smear = self._calibration.vectors_to_px(each.velocity_um_s * self._camera.exposure_s).tolist()

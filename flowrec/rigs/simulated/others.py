@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, Truth
+from flowrec.core import Truth
 from flowrec.physics import Chip, Robot
 from flowrec.rigs.simulated.bodies import Swimmer
+from flowrec.rigs.simulated.microscope import DrawnRobot
 from flowrec.stages import Simulated, robot_topic
 
 _STREAM = 10  # of the seed, with the number of the robot
@@ -24,20 +25,10 @@ _RESPONSE = 0.25  # um per revolution and step-out are those of the first robot 
 _LAG_S = 0.03  # behind the first robot, at most
 _NOISE = (0.7, 1.5)  # rolling noise over that of the first robot
 _RADIUS = (0.88, 1.12)  # over that of the first robot
-DARKNESS = 0.8  # of the first robot
-_DARKNESS = (0.6, 0.85)
+_DARKNESS = (0.6, 0.85)  # that of the first robot is 0.8
 _NEAR_RADII, _FAR_RADII = 4.0, 25.0  # from the start of the first robot
 _APART_RADII = 3.0  # between the starts of the others
 _ROOM_RADII = 1.5  # from a start to the walls
-
-
-class DrawnRobot(NamedTuple):
-    """A robot in an image."""
-
-    position_um: Floats
-    radius_um: float
-    velocity_um_s: Floats
-    darkness: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,9 @@ _GATE = 16.0  # as of `assign`: four standard deviations
 _FIT_RADII = 0.02  # error of a fitted place
 _EVERY = 10  # image in which robots other than the first one are looked for everywhere
 _EVERYWHERE_UM = 1e6  # standard deviation of the place of a robot that may be anywhere
-_TOLD_BY_OTHERS = 2.0  # sums of radii: a robot that was lost so near to another one is behind it
+_BEHIND = 2.0  # sums of radii: a robot that was lost so near to one that is seen is behind it
+_OWN_RADII = 3.0  # around a robot that was seen lately: a disc there is this robot, or none that is looked for everywhere
+_FORBIDDEN = 1e3  # cost of a pair that is never formed
 
 
 class Expected(NamedTuple):
@@ -88,7 +90,7 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
     np.fill_diagonal(apart, np.inf)
     known = np.array([track.score > 0.0 for track in previous])
     apart[~known] = apart[:, ~known] = np.inf
-    behind = apart.min(axis=1) < _TOLD_BY_OTHERS
+    behind = apart[:, [track.seen for track in previous]].min(axis=1, initial=np.inf) < _BEHIND
     lost = ~known | (np.array([track.lost_frames > sought.reacquire_after for track in previous]) & ~behind)
     places: dict[int, Floats] = {}
     for group in _groups(apart[np.ix_(~lost, ~lost)] < _TOUCH):
@@ -111,7 +113,10 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
     ]
     variance = np.where(lost, _EVERYWHERE_UM, std_um)[alone] ** 2 / um_per_px**2
     spots = np.array([(disc.x, disc.y) for disc in found]).reshape(-1, 2)
-    unlike = np.array([[_unlike(sought, previous[n], disc) for disc in found] for n in alone]).reshape(-1, len(found))
+    unlike = np.array([[_unlike(sought, previous[n], disc) for disc in found] for n in alone])
+    if lost.any() and len(found):
+        away = np.hypot(*(spots[:, None] - px[~lost]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+        unlike[np.ix_(lost[alone], away < _OWN_RADII * sought.search.nominal_px)] = _FORBIDDEN
     pairs = {alone[row]: found[column] for row, column in zip(*assign(px[alone], variance, spots, unlike), strict=True)}
     tracks = []
     for n, track in enumerate(previous):

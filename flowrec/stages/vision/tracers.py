@@ -152,6 +152,7 @@ def assign(
     alone = (np.bincount(rows, minlength=len(expected))[rows] == 1) & (
         np.bincount(columns, minlength=len(spots))[columns] == 1
     )
+    alone &= cost < 1.0  # beyond that a body is rather missed
     found = [(rows[alone], columns[alone])]
     rows, columns, cost = rows[~alone], columns[~alone], cost[~alone]
     if len(rows):
