@@ -105,20 +105,22 @@ def _wall(
 
 
 def expected_robots(last: Tick, count: int, applied: Applied, stamp_ns: int, robot: Robot) -> list[Expected]:
-    """Where each of the robots is expected now, from their estimates of the tick before."""
+    """Where each of the robots is expected now: from where it was seen on the tick before, else from its estimate."""
     found = []
     for number in range(count):
-        estimate = estimate_of(last, number)
-        if estimate is None or not np.isfinite(estimate.position_um).all():
+        estimate, track = estimate_of(last, number), track_of(last, number)
+        if estimate is None or track is None or not np.isfinite(estimate.position_um).all():
             found.append(Expected(np.zeros(2), _FARTHEST_UM))
             continue
         dt = seconds(stamp_ns - estimate.stamp_ns)
         um_per_rev = robot.um_per_rev if estimate.um_per_rev is None else estimate.um_per_rev
         own_um = um_per_rev * applied.turns
         p = estimate.covariance
-        variance = 0.5 * np.trace(p[:2, :2] + 2.0 * dt * p[:2, 2:4] + dt**2 * p[2:4, 2:4])
+        variance = 0.5 * dt**2 * np.trace(p[2:4, 2:4])
+        if not track.seen:
+            variance += 0.5 * np.trace(p[:2, :2] + 2.0 * dt * p[:2, 2:4])
         std_um = math.hypot(math.sqrt(max(variance, 0.0)), _OWN_ERROR * math.hypot(*own_um), _STD_RADII * robot.radius_um)
-        place_um = estimate.position_um + own_um + dt * estimate.flow_um_s
+        place_um = (track.position_um if track.seen else estimate.position_um) + own_um + dt * estimate.flow_um_s
         found.append(Expected(place_um, min(std_um, _FARTHEST_UM)))
     return found
 

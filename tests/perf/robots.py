@@ -58,7 +58,7 @@ class Score:
                     self.follows[number] = nearest
                 continue
             if away[own] < _NEAR:
-                self.right[own] += 1.0
+                self.right[own] += inside[own]
             elif away[nearest] < 0.5 * _NEAR:
                 self.switches += 1
                 other = next((k for k, each in self.follows.items() if each == nearest), None)

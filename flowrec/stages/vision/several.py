@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, Frame, Track
+from flowrec.core import Floats, Frame, Track, seconds
 from flowrec.physics import Calibration, Robot
 from flowrec.stages.vision.disc_search import LARGEST, Disc, DiscSearch, discs
 from flowrec.stages.vision.joint_fit import Body, fit_jointly
@@ -55,7 +55,7 @@ class Sought(NamedTuple):
     calibration: Calibration
     robot: Robot
     search: DiscSearch  # in the whole channel
-    least_score: float  # of a robot that was seen on the image before
+    least_score: float  # of a robot near its expected place
     near_px: float  # least range of a search around an expected place
     reacquire_after: int
     noise: float
@@ -111,7 +111,8 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
         for disc in _apart(found, sought.search.nominal_px)
         if not (np.hypot(*(taken - (disc.x, disc.y)).T) < _SAME_RADII * sought.search.nominal_px).any()
     ]
-    variance = np.where(lost, _EVERYWHERE_UM, std_um)[alone] ** 2 / um_per_px**2
+    std_um = np.where(lost, [_lost_std_um(sought, track) for track in previous], std_um)
+    variance = std_um[alone] ** 2 / um_per_px**2
     spots = np.array([(disc.x, disc.y) for disc in found]).reshape(-1, 2)
     unlike = np.array([[_unlike(sought, previous[n], disc) for disc in found] for n in alone])
     if lost.any() and len(found):
@@ -130,6 +131,13 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
     return tracks
 
 
+def _lost_std_um(sought: Sought, track: Track) -> float:
+    """Standard deviation of the place of a robot that was not seen for long: as far as it may have gone."""
+    if track.seen_ns is None:
+        return _EVERYWHERE_UM
+    return sought.robot.radius_um + sought.robot.max_speed_um_s * seconds(sought.frame.stamp_ns - track.seen_ns)
+
+
 def _near(sought: Sought, track: Track, at_px: Floats, std_px: float) -> list[Disc]:
     """The discs near the place of a robot that was seen lately."""
     x0, y0, x1, y1 = sought.walls.box
@@ -141,10 +149,9 @@ def _near(sought: Sought, track: Track, at_px: Floats, std_px: float) -> list[Di
         min(math.ceil(x + range_px) + 1, x1),
         min(math.ceil(y + range_px) + 1, y1),
     )
-    expected_px = track.radius_px
-    search = replace(sought.search, box=box, centre=(x, y), range_px=range_px, expected_px=expected_px)
-    if not track.lost_frames:
-        search = replace(search, least_score=sought.least_score, least_likeness=0.0)
+    search = replace(sought.search, box=box, centre=(x, y), range_px=range_px, expected_px=track.radius_px)
+    # Debris near it is told apart by its look.
+    search = replace(search, least_score=sought.least_score, least_likeness=0.0)
     return list(discs(sought.image, sought.walls, search))
 
 
