@@ -5,6 +5,7 @@ The first robot, number 0, has the fields themselves; the paths of number k have
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 from flowrec.core import BY_FIELD, WALLS, Estimate, RobotWalls, Source, Tick, Topic, Track
 from flowrec.stages.rig_settings import SIMULATED
 
+_NUMBERED = re.compile(r"(?:/truth)?/robot/(\d+)(?:/|$)")
 _OF_EACH = ("track", "estimate")  # fields of Tick that each robot has
 _WALLS_TOPIC = Topic(WALLS, Source.STAGE, 1e-6, type=RobotWalls)
 _TRACK, _ESTIMATE = (BY_FIELD[name].path for name in _OF_EACH)
@@ -46,6 +48,20 @@ def estimate_of(tick: Tick, number: int) -> Estimate | None:
     """The latest estimate of a robot."""
     message = tick.estimate if number == 0 else tick.extra.get(robot_topic(_ESTIMATE, number))
     return message if isinstance(message, Estimate) else None
+
+
+def robot_number(path: str) -> int:
+    """The number of the robot that a topic is of; 0 for the first one's, and for topics of none."""
+    found = _NUMBERED.match(path)
+    return int(found[1]) if found else 0
+
+
+def estimates_of_others(tick: Tick) -> list[Estimate]:
+    """The latest estimates of all robots but the first one, in the order of their numbers."""
+    found: list[Estimate] = []
+    while (estimate := estimate_of(tick, len(found) + 1)) is not None:
+        found.append(estimate)
+    return found
 
 
 def messages_of(number: int, track: Track, estimate: Estimate) -> dict[str, Track | Estimate]:

@@ -32,6 +32,7 @@ class Score:
         self.switches = 0
         self.right, self.in_view = np.zeros(count), np.zeros(count)
         self.contacts = np.zeros(count)
+        self.encounters, self._meet = 0, np.zeros((count, count), np.bool_)
         self.ms: list[float] = []
 
     def write(self, tick: Tick) -> None:
@@ -44,6 +45,10 @@ class Score:
         inside = np.isfinite(clear_um) & (edge_um > self.radius_um)  # of the chip, which the image shows
         self.contacts = np.array([truth.contacts for truth in truths if isinstance(truth, Truth)])
         self.in_view += inside
+        apart = np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) + np.where(inside, 0.0, np.inf)
+        meet = np.triu((apart < 2.0 * self.radius_um) & inside[:, None], 1)
+        self.encounters += int((meet & ~self._meet).sum())
+        self._meet = meet
         if tick.timing is not None:
             self.ms.append(tick.timing.track_ms + tick.timing.observe_ms)
         for number in range(self.count):
@@ -83,6 +88,7 @@ def fly(seed: int, robots: int, duration_s: float, world: str, sets: Sequence[st
         "outcome": report.outcome,
         "seconds": report.duration_s,
         "switches": score.switches,
+        "encounters": score.encounters,
         "tracked": tracked,
         "contacts": score.contacts.tolist(),
         "ms": float(np.median(score.ms)) if score.ms else math.nan,
@@ -108,7 +114,8 @@ def measure(
         rows.append(row)
         shares = " ".join(f"{share:.2f}" for share in row["tracked"])
         print(
-            f"seed {seed}: {row['outcome']} after {row['seconds']:.1f} s, {row['switches']} switches, tracked {shares}, "
+            f"seed {seed}: {row['outcome']} after {row['seconds']:.1f} s, {row['switches']} switches in "
+            f"{row['encounters']} encounters, tracked {shares}, "
             f"contacts {row['contacts']}, {row['ms']:.2f} ms an image",
             flush=True,
         )
@@ -116,7 +123,7 @@ def measure(
     contacts = [sum(row["contacts"][1:]) for row in rows]
     print(
         f"{len(rows)} missions, {sum(row['seconds'] for row in rows):.0f} s: {sum(row['switches'] for row in rows)} "
-        f"switches; the first tracked {np.mean([row['tracked'][0] for row in rows]):.3f}, "
+        f"switches in {sum(row['encounters'] for row in rows)} encounters; the first tracked {np.mean([row['tracked'][0] for row in rows]):.3f}, "
         f"the others {np.mean(shares) if shares else math.nan:.3f}; contacts of the first "
         f"{sum(row['contacts'][0] for row in rows)}, of the others {sum(contacts)}; "
         f"{np.median([row['ms'] for row in rows]):.2f} ms an image"
