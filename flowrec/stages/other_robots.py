@@ -38,14 +38,14 @@ _OWN_ERROR = 0.3  # standard deviation of a robot's own displacement in a frame,
 _STD_RADII = 0.12  # least error of an expected place
 _FARTHEST_UM = 1e5  # standard deviation of a place of which nothing is known
 _SEEN_S = 1.0  # a robot that was not seen for longer may be anywhere
-_OVER = 1.2  # of the distance at which an alarm begins: there it ends
+_OVER = 1.6  # of the distance at which an alarm begins: there it ends
 
 
 @dataclass(frozen=True, slots=True)
 class OtherRobots:
     """Robots beside the mission's one: their distance from the walls."""
 
-    # alarm below this distance from the surface of another robot to a wall; None: the robot's radius
+    # alarm below this distance from the surface of another robot to a wall; None: half the robot's radius
     near_um: Annotated[float, Range(0.0, 1e5)] | None = None
     # Largest speed of the mission's robot through the fluid while another robot is so near to a wall and the command
     # drives it there. None: no limit
@@ -69,7 +69,7 @@ class OtherRobots:
         clearance_um : (h, w) from each pixel centre of the chip to the nearest wall.
         """
         before, demand = last.extra.get(WALLS), last.demand
-        near_um = robot.radius_um if self.near_um is None else self.near_um
+        near_um = 0.5 * robot.radius_um if self.near_um is None else self.near_um
         told = before if isinstance(before, RobotWalls) else None
         rows = []
         for number, (track, estimate) in enumerate(zip(tracks, estimates, strict=True)):

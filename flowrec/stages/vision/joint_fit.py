@@ -5,8 +5,8 @@ The light that passes is the product of what each robot lets through,
     I = b prod_k (1 - a_k disc(s_k) + 0.35 a_k rim(s_k)),    s_k = (|p - x_k| - r_k) / e_k,
 
 with disc and rim of disc_fit.py; radius r and darkness a of each are known from when it was alone. The places x are those
-of largest posterior probability, from where each robot is expected with a variance: where one hides another, the image
-says little of their difference, and the expectation decides. Among all ways to exchange the robots that is kept whose
+of largest posterior probability, from where each robot is expected with a variance. Where one hides another, a small error
+of the model decides how far they seem apart; so their distance is kept as expected, and they are moved as one. Among all ways to exchange the robots that is kept whose
 cost is least, so that their looks tell them apart where their ways do not.
 """
 
@@ -25,6 +25,7 @@ from flowrec.stages.vision.walls import Walls
 _STEEPNESS, _RIM_POSITION, _RIM_WIDTH = 2.2, 2.0, 1.1  # as in disc_fit.py
 _ITERATIONS = 6  # of the Gauss-Newton steps
 _PERMUTED = 3  # robots at most whose exchange is tried: six ways
+_HIDDEN = 0.5  # of the sum of two radii: nearer robots hide each other
 _MISFIT = 0.1  # of the background: standard deviation of a pixel about the model, whose neighbours err alike
 _ALIKE_PX = 9.0  # pixels that err alike
 _BOX_RADII = 1.8  # around the robots
@@ -60,7 +61,11 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
     share = np.clip([body.darkness / level for body in bodies], 0.05, 0.98)
     weight = step**2 / (_ALIKE_PX * (_MISFIT * level) ** 2)
     precision = np.array([1.0 / max(body.variance_px2, 1e-6) for body in bodies])
-    orders = itertools.permutations(range(len(bodies))) if len(bodies) <= _PERMUTED else [tuple(range(len(bodies)))]
+    apart = np.hypot(*(expected[:, None] - expected).transpose(2, 0, 1)) / (radii[:, None] + radii)
+    as_one = bool((apart[np.triu_indices(len(bodies), 1)] < _HIDDEN).any())
+    as_they_are = [tuple(range(len(bodies)))]
+    orders = itertools.permutations(range(len(bodies))) if len(bodies) <= _PERMUTED and not as_one else as_they_are
+    moves = np.tile(np.eye(2), (len(bodies), 1)) if as_one else np.eye(2 * len(bodies))
     best: tuple[float, Floats, float] | None = None
     for order in orders:
         places = expected[list(order)].copy()
@@ -70,7 +75,7 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
             jacobian = level * slopes.reshape(len(grey), -1)
             normal = weight * jacobian.T @ jacobian + np.diag(np.repeat(precision, 2))
             slope = weight * jacobian.T @ off - (precision[:, None] * (places - expected)).ravel()
-            move = np.linalg.solve(normal, slope).reshape(-1, 2)
+            move = (moves @ np.linalg.solve(moves.T @ normal @ moves, moves.T @ slope)).reshape(-1, 2)
             longest = np.hypot(*move.T) / (0.5 * radii)
             places += move / np.maximum(longest, 1.0)[:, None]
         residual = float(((grey - level * _light(pixels, places, radii, share)[0]) ** 2).sum())
