@@ -119,7 +119,9 @@ def expected_robots(last: Tick, count: int, applied: Applied, stamp_ns: int, rob
         variance = 0.5 * dt**2 * np.trace(p[2:4, 2:4])
         if not track.seen:
             variance += 0.5 * np.trace(p[:2, :2] + 2.0 * dt * p[:2, 2:4])
-        std_um = math.hypot(math.sqrt(max(variance, 0.0)), _OWN_ERROR * math.hypot(*own_um), _STD_RADII * robot.radius_um)
+        std_um = math.hypot(
+            math.sqrt(max(variance, 0.0)), _OWN_ERROR * math.hypot(*own_um), _STD_RADII * robot.radius_um
+        )
         place_um = (track.position_um if track.seen else estimate.position_um) + own_um + dt * estimate.flow_um_s
         found.append(Expected(place_um, min(std_um, _FARTHEST_UM)))
     return found

@@ -246,9 +246,7 @@ def look(p: Pipeline, last: Sight, frame: Frame, expected: Sequence[Expected] = 
         found = p.tracker.follow(previous, last.appearance, frame, p.chip, p.calibration, p.robot, off_px)
     tracers = None
     if p.tracker.tracers:
-        tracers = p.tracker.tracer.follow(
-            last.tracers, found[0], frame, p.chip, p.calibration, p.robot, off_px, others
-        )
+        tracers = p.tracker.tracer.follow(last.tracers, found[0], frame, p.chip, p.calibration, p.robot, off_px, others)
     return Sight(*found, background, shift, tracers, tuple(others))
 
 

@@ -139,7 +139,6 @@ class Overlay:
         restore(picture, clean, centre, ring)
         draw_outline(picture, centre + ring * CIRCLE, colour, _LINE_PX * unit)
 
-
     def _draw_other(self, picture: Picture, estimate: Estimate, colour: colours.Rgb) -> None:
         """The ring of a robot that is not the mission's."""
         centre = self.zoom * (self._scene.to_plane(estimate.position_um) + np.array(shift_px(self._tick.shift))) - 0.5

@@ -10,14 +10,14 @@ import pytest
 
 from flowrec.core import WALLS, Applied, Demand, Estimate, RobotWalls, Source, Tick, Topic, Track, Truth
 from flowrec.core.topics import Extra
-from flowrec.physics import Robot, clearance_um
+from flowrec.physics import Robot, clearance_um, load_chip
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, run
 from flowrec.stages import assemble, load_config, resolve, robot_topic
 from flowrec.stages.control.events import event_of
 from flowrec.stages.estimation import Observer
 from flowrec.stages.other_robots import OtherRobots, expected_robots, observe_others
-from flowrec.stages.pipeline import Inputs, step
+from flowrec.stages.pipeline import step
 from flowrec.stages.robot_topics import messages_of, robot_number, robot_topics
 from tests.short_missions import SMALL
 
@@ -131,13 +131,12 @@ def test_topics_are_those_of_the_first_robot_with_a_number() -> None:
 
 def test_no_stage_reads_the_truth_of_a_robot() -> None:
     config = load_config(None, SEVERAL)
-    config = resolve(config, chip := __import__("flowrec.physics", fromlist=["load_chip"]).load_chip(config.chip))
+    chip = load_chip(config.chip)
+    config = resolve(config, chip)
     pipeline = assemble(config, chip)
-    arrived: list[Inputs] = []
     rig = SimulatedRig.of(pipeline, config, duration_s=1.0)
     true, other = Tick(), Tick()
     for inputs in rig.inputs():
-        arrived.append(inputs)
         true = step(pipeline, true, inputs)
         lied = {path: replace(told, position_um=told.position_um + 500.0) for path, told in inputs.extra.items()}
         assert lied and all(isinstance(told, Truth) for told in lied.values())
@@ -155,8 +154,6 @@ def test_a_limit_slows_the_command_while_a_robot_is_near_a_wall() -> None:
     for limit in (None, 60.0):
         sets = [*SEVERAL, "others.near_um=1000", *([f"others.speed_limit_um_s={limit}"] if limit else [])]
         config = load_config(None, sets)
-        from flowrec.physics import load_chip
-
         chip = load_chip(config.chip)
         config = resolve(config, chip)
         pipeline = assemble(config, chip)

@@ -183,7 +183,9 @@ class Microscope:
                 strict=True,
             )
         ]
-        robots = [each._replace(position_um=each.position_um + (0.0 if stage_um is None else stage_um)) for each in others]
+        robots = [
+            each._replace(position_um=each.position_um + (0.0 if stage_um is None else stage_um)) for each in others
+        ]
         if robot_um is not None:
             robots.append(DrawnRobot(robot_um, robot_radius_um, robot_velocity_um_s, _DARKNESS))
         for each in robots:

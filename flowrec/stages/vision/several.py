@@ -35,7 +35,9 @@ _FIT_RADII = 0.02  # error of a fitted place
 _EVERY = 10  # image in which robots other than the first one are looked for everywhere
 _EVERYWHERE_UM = 1e6  # standard deviation of the place of a robot that may be anywhere
 _BEHIND = 2.0  # sums of radii: a robot that was lost so near to one that is seen is behind it
-_OWN_RADII = 3.0  # around a robot that was seen lately: a disc there is this robot, or none that is looked for everywhere
+_OWN_RADII = (
+    3.0  # around a robot that was seen lately: a disc there is this robot, or none that is looked for everywhere
+)
 _FORBIDDEN = 1e3  # cost of a pair that is never formed
 
 

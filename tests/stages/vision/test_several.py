@@ -48,7 +48,15 @@ def followed(ways: np.ndarray, start: int = 0, std_px: float = 1.0, tracker: Tra
         for now, step in zip(tracks[-1] if tracks else (), velocity, strict=False):
             expected.append(Expected(now.position_um + step, (std_px + 0.3 * now.lost_frames) * UM))
         found, look = tracker.follow_all(
-            tracks[-1] if tracks else [], expected, look, image, CHIP, CALIBRATION, ROBOT, (0.0, 0.0), ways[0, start] * UM
+            tracks[-1] if tracks else [],
+            expected,
+            look,
+            image,
+            CHIP,
+            CALIBRATION,
+            ROBOT,
+            (0.0, 0.0),
+            ways[0, start] * UM,
         )
         tracks.append(found)
     return tracks
