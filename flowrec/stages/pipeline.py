@@ -253,7 +253,7 @@ def look(p: Pipeline, last: Sight, frame: Frame, expected: Sequence[Expected] = 
 def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
     """Position of the robots, when each was last seen, and how they look. A repeated image counts as not seen."""
     count, known = p.tracker.count, tracks_of_others(last, p.tracker.count)
-    previous, before = last.track, Sight(*(getattr(last, name) for name in FROM_IMAGE), tuple(known))
+    previous, before = last.track, Sight(*(getattr(last, name) for name in FROM_IMAGE))._replace(others=tuple(known))
     if inputs.applied.repeats_image and previous is not None:
         others = tuple(unseen(each, inputs.stamp_ns) for each in known)
         return before._replace(track=unseen(previous, inputs.stamp_ns), others=others)
@@ -263,8 +263,9 @@ def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
         return before._replace(**new, others=tuple(tracks_of_others(Tick(extra=Extra(inputs.extra)), count)))
     expected = expected_robots(last, count, inputs.applied, inputs.stamp_ns, p.robot) if known else []
     sight = look(p, before, inputs.frame, expected)
-    seen = [replace(new, seen_ns=_seen_ns(new, old)) for new, old in zip(sight.others, known or [None] * count)]
-    track, sight = sight.track, sight._replace(others=tuple(seen))
+    before_them = known or [None] * len(sight.others)
+    others = tuple(replace(new, seen_ns=_seen_ns(new, old)) for new, old in zip(sight.others, before_them, strict=True))
+    track, sight = sight.track, sight._replace(others=others)
     if inputs.applied.image_since_ns is None or track is None:
         return sight
     return sight._replace(track=replace(track, seen_ns=_seen_ns(track, previous)))

@@ -123,7 +123,8 @@ def measure(
     contacts = [sum(row["contacts"][1:]) for row in rows]
     print(
         f"{len(rows)} missions, {sum(row['seconds'] for row in rows):.0f} s: {sum(row['switches'] for row in rows)} "
-        f"switches in {sum(row['encounters'] for row in rows)} encounters; the first tracked {np.mean([row['tracked'][0] for row in rows]):.3f}, "
+        f"switches in {sum(row['encounters'] for row in rows)} encounters; the first tracked "
+        f"{np.mean([row['tracked'][0] for row in rows]):.3f}, "
         f"the others {np.mean(shares) if shares else math.nan:.3f}; contacts of the first "
         f"{sum(row['contacts'][0] for row in rows)}, of the others {sum(contacts)}; "
         f"{np.median([row['ms'] for row in rows]):.2f} ms an image"

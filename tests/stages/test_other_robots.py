@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ def test_the_alarm_begins_below_a_distance_and_ends_farther_off() -> None:
     assert walls(FLOOR_UM - 95.0, settings=settings, before=near).near[0] == 1.0
     assert walls(FLOOR_UM - 130.0, settings=settings, before=near).near[0] == 0.0
     ticks = [Tick(extra=Extra({WALLS: each})) for each in (far, near, far)]
-    said = [event_of(a, b) for a, b in zip(ticks, ticks[1:], strict=False)]
+    said = [event_of(a, b) for a, b in pairwise(ticks)]
     assert "robot 1 is 35 um from a wall" in said[0].text and "alarm over: robot 1" in said[1].text
 
 

@@ -1,8 +1,8 @@
 """The other robots of a simulated world: in the same field and the same flow, each with a response of its own.
 
 Of each is drawn: um per revolution, step-out frequency, a lag behind the first robot, noise of its rolling, radius and
-darkness. They start near the first robot, as a lab puts them in. Robots exert no force on each other, neither by contact
-nor as magnets: they pass over each other, and then one hides the other.
+darkness. They start near the first robot, as a lab puts them in. Robots exert no force on each other, neither by
+contact nor as magnets: they pass over each other, and then one hides the other.
 """
 
 from __future__ import annotations

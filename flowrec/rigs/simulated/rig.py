@@ -334,7 +334,7 @@ class SimulatedRig:
             self._acting = self._coming.pop(0)[1]
 
     def _turn(self, swimmers: Sequence[Swimmer], command: Currents, duration_s: float) -> NDArray[np.float64]:
-        """Let the field turn, and the robots with it, as control/field_rotation.py describes. Returns the turns (2,)."""
+        """Let the field turn, and the robots with it, as control/field_rotation.py has it. Returns the turns (2,)."""
         way = field_motion(self._rotation, _order(command))
         self._rotation = way.after(duration_s)
         turns = np.zeros(2)

@@ -117,7 +117,7 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
     variance = std_um[alone] ** 2 / um_per_px**2
     spots = np.array([(disc.x, disc.y) for disc in found]).reshape(-1, 2)
     unlike = np.array([[_unlike(sought, previous[n], disc) for disc in found] for n in alone])
-    if lost.any() and len(found):
+    if lost.any() and found:
         away = np.hypot(*(spots[:, None] - px[~lost]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
         unlike[np.ix_(lost[alone], away < _OWN_RADII * sought.search.nominal_px)] = _FORBIDDEN
     pairs = {alone[row]: found[column] for row, column in zip(*assign(px[alone], variance, spots, unlike), strict=True)}

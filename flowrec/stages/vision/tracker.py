@@ -152,8 +152,8 @@ class Tracker:
         given = {"method": self._other, "click_px": self.click_px, "box_px": self.box_px}
         if self.count > 1 and (names := [name for name, value in given.items() if value is not None]):
             raise UsageError(
-                f"tracker.{names[0]} is for one robot, and {self.count} are to be followed; leave it out (tracker.robots_px "
-                "names a point on each)"
+                f"tracker.{names[0]} is for one robot, and {self.count} are to be followed; leave it out "
+                "(tracker.robots_px names a point on each)"
             )
 
     @property

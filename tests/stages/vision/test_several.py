@@ -43,7 +43,7 @@ def followed(ways: np.ndarray, start: int = 0, std_px: float = 1.0, tracker: Tra
         expected = []
         if len(tracks) > 1:
             for n, (now, then) in enumerate(zip(tracks[-1], tracks[-2], strict=True)):
-                # As an observer: a mean velocity, with which it goes on, and knows less of the place while it is not seen.
+                # As an observer: a mean velocity, with which it goes on; it knows less of the place without a sight.
                 velocity[n] += 0.2 * (now.position_um - then.position_um - velocity[n])
         for now, step in zip(tracks[-1] if tracks else (), velocity, strict=False):
             expected.append(Expected(now.position_um + step, (std_px + 0.3 * now.lost_frames) * UM))
@@ -144,6 +144,6 @@ def test_bright_robots_and_images_of_more_bits_are_followed_alike() -> None:
 
 
 def test_settings_of_one_robot_are_refused_with_several() -> None:
-    with pytest.raises(UsageError, match="tracker.click_px is for one robot"):
+    with pytest.raises(UsageError, match=r"tracker\.click_px is for one robot"):
         Tracker(robots=2, click_px=(3.0, 4.0)).refuse_unfit()
     Tracker(click_px=(3.0, 4.0)).refuse_unfit()
