@@ -75,7 +75,7 @@ class OtherRobots:
         for number, (track, estimate) in enumerate(zip(tracks, estimates, strict=True)):
             was_near = told is not None and bool(told.near[number])
             wall_um, away = _wall(estimate, track, radii_um[number], clearance_um, um_per_px)
-            own_um_s = _driven(demand, estimate, robot)
+            own_um_s = _command_of(demand, estimate, robot)
             near = wall_um < near_um * (_OVER if was_near else 1.0)  # False for NaN
             rows.append((wall_um, float(near), -float(own_um_s @ away)))
         distance_um, near_ones, towards_um_s = np.array(rows).reshape(-1, 3).T
@@ -84,7 +84,7 @@ class OtherRobots:
         return RobotWalls(tracks[0].stamp_ns, distance_um, near_ones, towards_um_s, limit_um_s)
 
 
-def _driven(demand: Demand | None, estimate: Estimate, robot: Robot) -> NDArray[np.float64]:
+def _command_of(demand: Demand | None, estimate: Estimate, robot: Robot) -> NDArray[np.float64]:
     """Velocity (2,) through the fluid that the last command gives another robot, um/s."""
     if demand is None:
         return np.zeros(2)
@@ -105,7 +105,7 @@ def _wall(
 
 
 def expected_robots(last: Tick, count: int, applied: Applied, stamp_ns: int, robot: Robot) -> list[Expected]:
-    """Where each of the robots is expected now: from where it was seen on the tick before, else from its estimate."""
+    """The places where the robots are expected now: from those seen on the tick before, else from their estimates."""
     found = []
     for number in range(count):
         estimate, track = estimate_of(last, number), track_of(last, number)

@@ -18,7 +18,8 @@ from flowrec.core.errors import FlowrecError
 from flowrec.physics import load_chip
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, run
-from flowrec.stages import assemble, load_config, resolve, robot_topic, track_of
+from flowrec.stages import assemble, load_config, resolve, robot_topic
+from flowrec.stages.robot_topics import track_of
 
 _NEAR = 1.0  # radii between a track and the robot that it follows
 

@@ -82,8 +82,8 @@ class OtherRobot(Swimmer):
                 self._coming.appendleft(replace(now, duration_s=now.duration_s - lasts_s))
             left_s -= lasts_s
 
-    def drawn(self, elapsed_s: float) -> DrawnRobot:
-        """Where and how an image shows it, that long after the last image."""
+    def look(self, elapsed_s: float) -> DrawnRobot:
+        """Its place and look in an image that comes so long after the last one."""
         velocity = (self.position_um - self._before_um) / elapsed_s if elapsed_s > 0 else np.zeros(2)
         self._before_um = self.position_um
         return DrawnRobot(self.position_um, self.radius_um, velocity, self.darkness)

@@ -35,7 +35,7 @@ from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.beads import Beads
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.rigs.simulated.others import other_robots
+from flowrec.rigs.simulated.others import OtherRobot, other_robots
 from flowrec.rigs.simulated.pump_sensor import PumpSensor
 from flowrec.rigs.simulated.world import (
     Shake,
@@ -235,13 +235,8 @@ class SimulatedRig:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
         world = self.true_world()
         field, walls = world.field, world.clearance_um
-        radius, seed, px = self._robot.radius_um, self._simulated.seed, self._chip.um_per_px
-        swimmer = Swimmer(
-            self._start_um, self._true_robot, self._simulated, field, walls, px, self.pump, world.hindrance
-        )
-        common = {"field": field, "pump": self.pump, "hindrance": world.hindrance}
-        others = other_robots(self._chip, self._true_robot, self._simulated, self._start_um, walls, **common)
-        swimmers = [swimmer, *others]
+        radius, seed = self._robot.radius_um, self._simulated.seed
+        swimmer, others = self._swimmers(world)
         debris = Debris(self._chip, self._simulated.image.debris, radius, field, walls, seed)
         microscope = self._microscope()
         depth_um = true_depth_um(self._chip, self._simulated, radius)
@@ -258,7 +253,7 @@ class SimulatedRig:
         while index < self._frames:
             stamp = round(index * NS_PER_S / self._rate_hz)
             before = swimmer.position_um
-            turns = self._advance(swimmers, stamp)
+            turns = self._advance([swimmer, *others], stamp)
             elapsed = seconds(stamp - self._now_ns)
             if elapsed > 0:
                 debris.drift(elapsed)
@@ -272,7 +267,7 @@ class SimulatedRig:
                 radii,
                 darkness,
                 None if self._shake is None else self._shake.at(seconds(stamp)),
-                [each.drawn(elapsed) for each in others if not each.gone],
+                [each.look(elapsed) for each in others if not each.gone],
             )
             arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
             if self._realtime:
@@ -295,6 +290,14 @@ class SimulatedRig:
                 extra=dict(each.truth(stamped) for each in others),
             )
             index += 1
+
+    def _swimmers(self, world: World) -> tuple[Swimmer, list[OtherRobot]]:
+        """The robot of the mission and the others, at their starts."""
+        robot, simulated, start_um, px = self._true_robot, self._simulated, self._start_um, self._chip.um_per_px
+        field, walls, pump, hindrance = world.field, world.clearance_um, self.pump, world.hindrance
+        first = Swimmer(start_um, robot, simulated, field, walls, px, pump, hindrance)
+        common = {"field": field, "pump": pump, "hindrance": hindrance}
+        return first, other_robots(self._chip, robot, simulated, start_um, walls, **common)
 
     def tried(self) -> Generator[Inputs]:
         """Run on a copy of this rig with the same world and camera; a later run does not depend on it."""

@@ -42,7 +42,7 @@ _FORBIDDEN = 1e3  # cost of a pair that is never formed
 
 
 class Expected(NamedTuple):
-    """Where a robot is expected in an image."""
+    """The place at which a robot is expected in an image."""
 
     position_um: Floats  # (2,)
     std_um: float  # per component
@@ -79,7 +79,7 @@ def first_tracks(sought: Sought, count: int, at_um: Sequence[Floats]) -> list[Tr
     height, width = sought.frame.image.shape
     middle_um = sought.calibration.to_um(((width - 1) / 2, (height - 1) / 2))
     nobody = Track(sought.frame.stamp_ns, False, middle_um, 0.0, 0, sought.search.nominal_px, _roi(sought))
-    return [_seen(sought, nobody, disc) if disc is not None else _unseen(sought, nobody) for disc in chosen]
+    return [_see(sought, nobody, disc) if disc is not None else _miss(sought, nobody) for disc in chosen]
 
 
 def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Expected]) -> list[Track]:
@@ -127,9 +127,9 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
             moved = replace(track, position_um=sought.calibration.to_um(places[n]), seen=True, lost_frames=0)
             tracks.append(replace(moved, stamp_ns=sought.frame.stamp_ns))
         elif n in pairs:
-            tracks.append(_seen(sought, track, pairs[n]))
+            tracks.append(_see(sought, track, pairs[n]))
         else:
-            tracks.append(_unseen(sought, track))
+            tracks.append(_miss(sought, track))
     return tracks
 
 
@@ -200,7 +200,7 @@ def _unlike(sought: Sought, track: Track, disc: Disc) -> float:
     return min(size * size + dark * dark, _MOST_UNLIKE)
 
 
-def _seen(sought: Sought, track: Track, disc: Disc) -> Track:
+def _see(sought: Sought, track: Track, disc: Disc) -> Track:
     """The track of a robot that is a disc by itself."""
     nominal, energy = sought.search.nominal_px, (disc.darkness / sought.noise) ** 2
     first = track.energy <= 0.0
@@ -217,7 +217,7 @@ def _seen(sought: Sought, track: Track, disc: Disc) -> Track:
     )
 
 
-def _unseen(sought: Sought, track: Track) -> Track:
+def _miss(sought: Sought, track: Track) -> Track:
     return replace(track, stamp_ns=sought.frame.stamp_ns, seen=False, lost_frames=track.lost_frames + 1)
 
 
