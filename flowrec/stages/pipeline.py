@@ -263,9 +263,11 @@ def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
         return before._replace(**new, others=tuple(tracks_of_others(Tick(extra=Extra(inputs.extra)), count)))
     expected = expected_robots(last, count, inputs.applied, inputs.stamp_ns, p.robot) if known else []
     sight = look(p, before, inputs.frame, expected)
-    before_them: list[Track | None] = [*known] or [None] * len(sight.others)
-    others = tuple(replace(new, seen_ns=_seen_ns(new, old)) for new, old in zip(sight.others, before_them, strict=True))
-    track, sight = sight.track, sight._replace(others=others)
+    if sight.others:
+        before_them: list[Track | None] = [*known] or [None] * len(sight.others)
+        pairs = zip(sight.others, before_them, strict=True)
+        sight = sight._replace(others=tuple(replace(new, seen_ns=_seen_ns(new, old)) for new, old in pairs))
+    track = sight.track
     if inputs.applied.image_since_ns is None or track is None:
         return sight
     return sight._replace(track=replace(track, seen_ns=_seen_ns(track, previous)))
