@@ -117,6 +117,35 @@ def test_a_robot_that_is_missed_for_a_second_is_found_again_elsewhere() -> None:
     assert errors_px(tracks, ways, order_of(tracks, ways))[-1].max() < 0.5
 
 
+def found_at(tracker: Tracker, tracks: list, look, places, expected_px, std_px: float, index: int, **drawn) -> list:
+    """The tracks after one more image."""
+    expected = [Expected(np.array(place) * UM, std_px * UM) for place in expected_px]
+    image = frame(np.array(places, float), index, **drawn)
+    return tracker.follow_all(tracks, expected, look, image, CHIP, CALIBRATION, ROBOT, (0.0, 0.0), np.zeros(2))[0]
+
+
+def test_of_robots_that_may_be_anywhere_nearby_their_looks_tell_which_is_which() -> None:
+    tracker, looks = Tracker(robots=2, polarity="auto"), {"radii": [RADIUS_PX, 0.8 * RADIUS_PX], "darkness": [0.8, 0.5]}
+    places = np.array([[60.0, 60.0], [90.0, 60.0]])
+    first = frame(places, 0, **looks)
+    tracks, look = tracker.follow_all([], [], None, first, CHIP, CALIBRATION, ROBOT, (0.0, 0.0), places[0] * UM)
+    moved = places[::-1] + [[-10.0, 5.0], [10.0, 5.0]]  # each is now nearer to where the other one is expected
+    for each, place in zip(found_at(tracker, tracks, look, moved, places, 8.0, 1, **looks), moved, strict=True):
+        assert each.seen and np.hypot(*(each.position_um / UM - place)) < 3.0
+
+
+def test_a_robot_that_is_looked_for_everywhere_does_not_take_a_disc_beside_one_that_was_seen_just_now() -> None:
+    tracker, places = Tracker(robots=2, polarity="auto", reacquire_after=3), np.array([[60.0, 60.0], [140.0, 60.0]])
+    first = frame(places, 0)
+    tracks, look = tracker.follow_all([], [], None, first, CHIP, CALIBRATION, ROBOT, (0.0, 0.0), places[0] * UM)
+    for index in range(1, 10):
+        tracks = found_at(tracker, tracks, look, [places[0], (np.nan, np.nan)], places, 0.5, index)
+    assert tracks[0].seen and tracks[1].lost_frames == 9
+    # The first one moved farther than its observer can explain, on the image on which lost ones are looked for.
+    tracks = found_at(tracker, tracks, look, [(68.0, 60.0), (np.nan, np.nan)], places, 0.5, 10)
+    assert not tracks[1].seen
+
+
 def test_the_first_robot_is_the_one_nearest_to_the_start_or_the_one_that_is_pointed_at() -> None:
     ways = straight([[40, 40], [150, 60], [90, 90]], [[0, 0]] * 3, 2)
     assert order_of(followed(ways, start=2), ways)[0] == 2
