@@ -129,7 +129,7 @@ def test_of_robots_that_may_be_anywhere_nearby_their_looks_tell_which_is_which()
     places = np.array([[60.0, 60.0], [90.0, 60.0]])
     first = frame(places, 0, **looks)
     tracks, look = tracker.follow_all([], [], None, first, CHIP, CALIBRATION, ROBOT, (0.0, 0.0), places[0] * UM)
-    moved = places[::-1] + np.array([[-10.0, 5.0], [10.0, 5.0]])  # each is now nearer to where the other one is expected
+    moved = places[::-1] + np.array([[-10.0, 5.0], [10.0, 5.0]])  # each is nearer to where the other one was
     for each, place in zip(found_at(tracker, tracks, look, moved, places, 8.0, 1, **looks), moved, strict=True):
         assert each.seen and np.hypot(*(each.position_um / UM - place)) < 3.0
 
