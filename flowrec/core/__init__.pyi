@@ -41,7 +41,7 @@ from .messages import (
     Frame as Frame, Hand as Hand, Health as Health, Mission as Mission, Observations as Observations,
     BY_STREAM as BY_STREAM, EXPECTED as EXPECTED, HEARD as HEARD, SAMPLES as SAMPLES, SILENT as SILENT, STREAMS as STREAMS,
     PUMP as PUMP, PumpShare as PumpShare, Samples as Samples, StreamStates as StreamStates,
-    OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, Route as Route, Shift as Shift, TracerTruth as TracerTruth,
+    OperatorEvent as OperatorEvent, PIXEL_BITS as PIXEL_BITS, RobotWalls as RobotWalls, Route as Route, WALLS as WALLS, Shift as Shift, TracerTruth as TracerTruth,
     Tracers as Tracers, Track as Track,
     Truth as Truth, pixel_type as pixel_type, shift_px as shift_px,
 )

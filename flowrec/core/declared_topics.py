@@ -27,7 +27,7 @@ from flowrec.core.messages import Frame
 from flowrec.core.topics import BY_FIELD, BY_PATH, TOPICS, Extra, Tick
 
 SOURCES = (Source.RIG, Source.SIMULATOR, Source.STAGE)  # of a topic that is no field of Tick
-_PATH = re.compile(r"(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
+_PATH = re.compile(r"(/[A-Za-z][A-Za-z0-9_]*(/[0-9]{1,4})?)+", re.ASCII)
 _DRAWINGS = "/view/"
 _OWN_TYPES = {topic.type.__name__: topic.type for topic in TOPICS}
 _KINDS: dict[str, Any] = {"int": int, "float": float, "bool": bool, "str": str}

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from flowrec.core import Currents, Role, Tick, TopicTable
+from flowrec.core import Currents, Role, Tick, TopicTable, Track
 from flowrec.stages import ARRIVING, FROM_IMAGE, Inputs
 from flowrec.store import SessionReader
 
@@ -31,8 +31,9 @@ class RecordedRig:
         self._recompute = recompute
         self._end_ns = reader.last_ns if end_ns is None else end_ns
         self._topics = reader.topics if topics is None else topics
-        arriving = (topic.path for topic in reader.topics.extra if topic.role in (Role.INPUT, Role.TRUTH))
-        self._extra = frozenset(arriving)
+        extra = reader.topics.extra
+        self._extra = frozenset(topic.path for topic in extra if topic.role in (Role.INPUT, Role.TRUTH))
+        self._tracks = frozenset(topic.path for topic in extra if topic.type is Track)  # of an image that was dropped
         self.recorded = Tick()
         self.frames_missing = 0
 
@@ -65,10 +66,11 @@ class RecordedRig:
                 from_image = {name: getattr(tick, name) for name in FROM_IMAGE}
                 new |= {name: known for name, known in from_image.items() if known is not getattr(before, name)}
             if tick.extra is not before.extra:
+                taken = self._extra if new.get("frame") is not None else self._extra | self._tracks
                 new["extra"] = {
                     path: self._topics.as_declared(message, path)
                     for path, message in tick.extra.items()
-                    if path in self._extra and message is not before.extra.get(path)
+                    if path in taken and message is not before.extra.get(path)
                 }
             yield Inputs(tick.stamp_ns, **({"frame": None} | new))
             before = tick

@@ -42,6 +42,7 @@ from flowrec.stages.control.mission import MissionStateMachine, PlacedMission
 from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
 from flowrec.stages.estimation.pump import PumpFollower
 from flowrec.stages.extra_topics import TOPIC_ROWS
+from flowrec.stages.other_robots import OtherRobots
 from flowrec.stages.outside_settings import extend_config, key_of_section, our_class, sections
 from flowrec.stages.planning import PLANNERS, Planner, SurveyPlanner
 from flowrec.stages.refine import Refiner
@@ -134,6 +135,7 @@ class Config:
     health: HealthMonitor = field(default_factory=HealthMonitor)
     sampler: Sampler = field(default_factory=Sampler)
     pump: PumpFollower = field(default_factory=PumpFollower)
+    others: OtherRobots = field(default_factory=OtherRobots)
     flow: FlowSolver = field(default_factory=FlowSolver)
     refine: Refiner = field(default_factory=Refiner)
     survey: SurveyPlanner = field(default_factory=SurveyPlanner)

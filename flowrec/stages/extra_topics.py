@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from flowrec.core import FIXED, Message, Methods, Source, Tick, Topic, TopicTable, UsageError
+from flowrec.stages.robot_topics import robot_topics
 from flowrec.stages.stream_settings import PUMP_TOPIC, STREAM_TOPICS
 
 
@@ -58,7 +59,8 @@ def extra_rows(config: Any) -> Iterator[ExtraRow]:
 
 def topics_of(config: Any) -> TopicTable:
     """The topics of a run; UsageError if two of one path are named."""
-    if not config.topics and not config.streams:
+    pump = [PUMP_TOPIC] if config.pump.channel else []
+    ours = [*(STREAM_TOPICS if config.streams else ()), *pump, *robot_topics(config)]
+    if not config.topics and not ours:
         return FIXED
-    ours = [*(STREAM_TOPICS if config.streams else ()), *([PUMP_TOPIC] if config.pump.channel else [])]
     return TopicTable([*ours, *(row.topic for row in extra_rows(config))])

@@ -6,7 +6,7 @@ The previous Tick is all the state between ticks, so the pipeline can resume at 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
@@ -64,9 +64,16 @@ from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
 from flowrec.stages.estimation.pump import PumpFollower, at_pump
 from flowrec.stages.estimation.tracer_stretches import collect_stretches
 from flowrec.stages.extra_topics import ExtraStage, extra_rows, topics_of
+from flowrec.stages.other_robots import (
+    OtherRobots,
+    expected_robots,
+    messages_of_others,
+    observe_others,
+    tracks_of_others,
+)
 from flowrec.stages.planning import Planner, SurveyPlanner
 from flowrec.stages.refine import Refiner
-from flowrec.stages.vision import Stabiliser, Tracker, move_neighbours, unseen
+from flowrec.stages.vision import Expected, Stabiliser, Tracker, move_neighbours, unseen
 
 _RELEASE_S = 0.2  # from the moment at which a held robot may be let go until it is taken to be free
 
@@ -124,6 +131,7 @@ class Pipeline:
     health: HealthMonitor
     sampler: Sampler
     pump: PumpFollower
+    others: OtherRobots
     mission: MissionStateMachine
     controller: Controller
     coils: Coils
@@ -141,6 +149,7 @@ class Pipeline:
 def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     """The stages of a resolved configuration on its chip."""
     inertia, tracers = config.flow.convection, config.tracker.tracers
+    config.tracker.refuse_unfit()
     config.pump.refuse_unfit(chip, config.streams, inertia=inertia, tracers=tracers)
     return Pipeline(
         chip=chip,
@@ -156,6 +165,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
         health=config.health,
         sampler=config.sampler,
         pump=config.pump,
+        others=config.others,
         mission=config.mission,
         controller=config.control,
         coils=config.coils,
@@ -214,47 +224,66 @@ def _strength(coils: Coils, last: Tick) -> float:
 
 
 class Sight(NamedTuple):
-    """Results of an image: the robot, how it looks, how far the image lies off, and the tracers."""
+    """Results of an image: the robot, how it looks, how far the image lies off, the tracers, and the other robots."""
 
     track: Track | None = None
     appearance: Appearance | None = None
     background: Background | None = None
     shift: Shift | None = None
     tracers: Tracers | None = None
+    others: tuple[Track, ...] = ()
 
 
-def look(p: Pipeline, last: Sight, frame: Frame) -> Sight:
-    """Register the next image and find the robot in it."""
+def look(p: Pipeline, last: Sight, frame: Frame, expected: Sequence[Expected] = ()) -> Sight:
+    """Register the next image and find the robot in it; or all of several, each of which is expected somewhere."""
     shift, background = p.stabiliser.register(
         last.shift, last.background, last.track, frame, p.chip, p.calibration, p.robot
     )
     previous = last.track
     if shift is not None and previous is not None and last.shift is not None:
         previous = move_neighbours(previous, shift.shift_px - last.shift.shift_px)
-    found = p.tracker.follow(previous, last.appearance, frame, p.chip, p.calibration, p.robot, shift_px(shift))
+    off_px = shift_px(shift)
+    others: list[Track] = []
+    if p.tracker.count > 1:
+        seen = [] if previous is None else [previous, *last.others]
+        (first, *others), appearance = p.tracker.follow_all(
+            seen, expected, last.appearance, frame, p.chip, p.calibration, p.robot, off_px, np.array(p.mission.start)
+        )
+        found: tuple[Track, Appearance | None] = first, appearance
+    else:
+        found = p.tracker.follow(previous, last.appearance, frame, p.chip, p.calibration, p.robot, off_px)
     tracers = None
     if p.tracker.tracers:
-        tracers = p.tracker.tracer.follow(
-            last.tracers, found[0], frame, p.chip, p.calibration, p.robot, shift_px(shift)
-        )
-    return Sight(*found, background, shift, tracers)
+        tracers = p.tracker.tracer.follow(last.tracers, found[0], frame, p.chip, p.calibration, p.robot, off_px, others)
+    return Sight(*found, background, shift, tracers, tuple(others))
 
 
 def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
-    """Position of the robot, when it was last seen, and how it looks. A repeated image counts as not seen."""
-    previous, before = last.track, Sight(*(getattr(last, name) for name in FROM_IMAGE))
+    """Position of the robots, when each was last seen, and how they look. A repeated image counts as not seen."""
+    count, known = p.tracker.count, tracks_of_others(last, p.tracker.count)
+    previous, before = last.track, Sight(*(getattr(last, name) for name in FROM_IMAGE))._replace(others=tuple(known))
     if inputs.applied.repeats_image and previous is not None:
-        return before._replace(track=unseen(previous, inputs.stamp_ns))
+        others = tuple(unseen(each, inputs.stamp_ns) for each in known)
+        return before._replace(track=unseen(previous, inputs.stamp_ns), others=others)
     if inputs.frame is None:
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
         new = {name: message for name in FROM_IMAGE if (message := getattr(inputs, name)) is not None}
-        return before._replace(**new)
-    sight = look(p, before, inputs.frame)
+        return before._replace(**new, others=tuple(tracks_of_others(Tick(extra=Extra(inputs.extra)), count)))
+    expected = expected_robots(last, count, inputs.applied, inputs.stamp_ns, p.robot) if known else []
+    sight = look(p, before, inputs.frame, expected)
+    if sight.others:
+        before_them: list[Track | None] = [*known] or [None] * len(sight.others)
+        pairs = zip(sight.others, before_them, strict=True)
+        sight = sight._replace(others=tuple(replace(new, seen_ns=_seen_ns(new, old)) for new, old in pairs))
     track = sight.track
     if inputs.applied.image_since_ns is None or track is None:
         return sight
-    before_ns = previous.seen_ns if previous is not None else None
-    return sight._replace(track=replace(track, seen_ns=track.stamp_ns if track.seen else before_ns))
+    return sight._replace(track=replace(track, seen_ns=_seen_ns(track, previous)))
+
+
+def _seen_ns(track: Track, previous: Track | None) -> int | None:
+    """Stamp of the latest frame in which a robot was seen."""
+    return track.stamp_ns if track.seen else None if previous is None else previous.seen_ns
 
 
 def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track, rolled: Applied) -> tuple[AxesCheck | None, Floats | None]:
@@ -373,6 +402,13 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     if pump is not None:
         observations = p.pump.at_nominal(last.observations, observations, pump)
         tick = replace(tick, extra=tick.extra.with_messages({PUMP: pump}))
+    walls = None
+    if sight.others:
+        others = observe_others(p.observer, last, sight.others, rolled, p.robot, seen)
+        radii_um = [each.radius_px * p.calibration.um_per_px for each in sight.others]
+        walls = p.others.watch(last, sight.others, others, p.robot, radii_um, p.clearance_um, p.chip.um_per_px)
+        told = messages_of_others(sight.others, others, walls)
+        tick = replace(tick, extra=tick.extra.with_messages(told))
     tracer_flow = collect_stretches(last.tracer_flow, last.tracers, sight.tracers) if p.tracker.tracers else None
     lap("observe")
     axes, driven_um_s = _axes(p, last, tick, track, rolled)
@@ -398,7 +434,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     )
     if mission.by_hand:
         driven_um_s = np.zeros(2) if hand_share is None else None
-    robot = robot.slowed_to(mission.speed_limit_um_s)
+    robot = robot.slowed_to(mission.speed_limit_um_s).slowed_to(None if walls is None else walls.limit_um_s)
     demand = p.controller.control(
         last.demand,
         mission,

@@ -130,6 +130,8 @@ class Simulated:
     tracers: Annotated[int, Range(0, 10_000)] = 0  # beads that drift with the flow, each at a height of its own
     # density of the beads less that of the fluid: they settle; 50 is polystyrene in water, less in a matched fluid
     tracer_excess_kg_m3: Annotated[float, Range(0.0, 2e4)] = 5.0
+    # robots in the chip, all in the same field: the mission's one, and others of different response and look
+    robots: Annotated[int, Range(1, 100)] = 1
     image: SimulatedImage = field(default_factory=SimulatedImage)
     # how the robot is drawn: disc, the profile that the tracker fits; oblique, lit from one side
     optics: Optics | None = None

@@ -10,6 +10,7 @@ This file defines the wire layout. Fields are numbered in the order of the datac
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -69,7 +70,8 @@ def schema_of(message_type: type[Any], path: str = "") -> Schema:
 
     `path` : of an extra topic, whose type may be called like another one: its schema has a name and a pool of its own.
     """
-    file, message = _new(message_type.__name__, "flowrec" + (".extra" + path.replace("/", ".") if path else ""))
+    package = re.sub(r"\.(\d)", r"._\1", path.replace("/", "."))  # no name of protobuf begins with a digit
+    file, message = _new(message_type.__name__, "flowrec" + (".extra" + package if path else ""))
     for number, form in enumerate(message_fields(message_type), 1):
         field = message.field.add(name=form.name, number=number, label=_Field.LABEL_OPTIONAL)
         if form.kind == "vector":

@@ -209,8 +209,9 @@ class _Views:
 
 
 def _single(v: _Views) -> Shown:
-    tracers = ", tracers (purple)" if e.TRACERS in v.present else ""
-    name = f"Robot (orange), route (cyan){tracers}, flow" if v.tells_flow else f"Robot (orange){tracers}"
+    more = ", other robots" if e.OTHERS in v.present else ""
+    more += ", tracers (purple)" if e.TRACERS in v.present else ""
+    name = f"Robot (orange), route (cyan){more}, flow" if v.tells_flow else f"Robot (orange){more}"
     camera = v.camera(name, ["$origin/**"], entity_path("", "camera"))
     maps = (
         v.pair({"assumed": v.map("Assumed flow", e.ASSUMED), "refined": v.map("Refined flow", e.REFINED)}),

@@ -28,6 +28,7 @@ PURPLE: Rgb = (196, 140, 255)
 GREY: Rgb = (150, 150, 158)
 PALE: Rgb = (206, 206, 212)
 WHITE: Rgb = (236, 236, 240)
+_OF_OTHERS: tuple[Rgb, ...] = (BLUE, YELLOW, RED, WHITE, GREEN, PURPLE)  # of the robots from number 1 on, in turn
 # Of a phase of the mission, in all pictures; the report has tints of them. The others are grey.
 OF_PHASE: dict[str, Rgb] = {
     Phase.SURVEY: PURPLE,
@@ -103,6 +104,11 @@ def _round_step(step: float) -> float:
     """The smallest of 1, 2, 2.5, 5, 10 times a power of ten that is not below `step`."""
     power = 10.0 ** math.floor(math.log10(step))
     return next(m * power for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * power >= step * (1 - 1e-9))
+
+
+def of_robot(number: int) -> Rgb:
+    """The colour of a robot; the first one, number 0, is orange."""
+    return _OF_OTHERS[(number - 1) % len(_OF_OTHERS)] if number else ORANGE
 
 
 def round_below(number: float) -> float:

@@ -34,6 +34,7 @@ ROBOT = "camera/robot"
 ROBOT_LABEL = "camera/robot label"
 COMMAND = "camera/commanded velocity"
 TRACERS = "camera/tracers"
+OTHERS = "camera/other robots"
 
 ASSUMED = "flow/assumed/speed"
 REFINED = "flow/refined/speed"
@@ -74,7 +75,7 @@ LANES = (PHASE, ALARM, MARKS, LOSSES, SIGHT)
 LANES_OF_RUN = (MARKS, LOSSES, SIGHT)  # the same in a replay
 EXTRA = "extra"  # before the path of an extra topic and the field of its message
 # A session may lack these: a layout shows those that were logged.
-OPTIONAL = frozenset({*SCALES, *LANES, POSITION, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING, TRACERS})
+OPTIONAL = frozenset({*SCALES, *LANES, POSITION, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING, TRACERS, OTHERS})
 SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"

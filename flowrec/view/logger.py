@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
@@ -40,7 +41,7 @@ from flowrec.core import (
     with_micro,
 )
 from flowrec.physics import sample
-from flowrec.stages import tells_flow
+from flowrec.stages import estimates_of_others, robot_number, tells_flow
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.colours import Rgb
@@ -208,10 +209,14 @@ class TickLogger:
         for path, message in tick.extra.items():
             if message is self._last.extra.get(path):
                 continue
+            if robot_number(path):  # drawn in the image
+                continue
             if path == SAMPLES and hasattr(message, "latest") and hasattr(tick.extra.get(STREAMS), "channels"):
                 self._log_streams(message, tick.extra[STREAMS])
             else:
                 self._log_extra(path, message)
+        if tick.extra is not self._last.extra:
+            self._log_others(estimates_of_others(tick))
 
     def _log_message(self, message: Message) -> None:
         """Log a new message of the last tick."""
@@ -343,6 +348,15 @@ class TickLogger:
         self._scalars(e.FLOW_SPEED, *speeds)
         if math.isfinite(estimate.nis):
             self._scalars(e.NIS, estimate.nis)
+
+    def _log_others(self, estimates: Sequence[Estimate]) -> None:
+        """A ring in its colour around each robot that is not the mission's; pale while it is not seen."""
+        if not estimates:
+            return
+        centres = [self._scene.to_plane(place_on_chip(self._tick, each.position_um)) for each in estimates]
+        drawn = [colours.of_robot(n) if each.seen else colours.PALE for n, each in enumerate(estimates, start=1)]
+        rings = [centre + self._robot_px * CIRCLE for centre in centres]
+        self._log(e.OTHERS, rr.LineStrips2D(rings, colors=drawn, radii=points(1.2), draw_order=27.5))
 
     def _log_tracers(self, tracers: Tracers) -> None:
         """An arrow from each tracer that moves to where it will be soon."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import Estimate, Floats, FlowField, Tick, shift_px
+from flowrec.stages import estimates_of_others
 from flowrec.view import colours
 from flowrec.view.colours import round_below
 from flowrec.view.drawing import CIRCLE, NOMINAL_PX, Layer, Picture, Trail, arrows, draw_outline, drawable, restore
@@ -78,6 +79,8 @@ class Overlay:
         self._layer.blend(image, picture)
         if tick.estimate is not None:
             self._draw_robot(picture, clean, tick.estimate)
+        for number, estimate in enumerate(estimates_of_others(tick), start=1):
+            self._draw_other(picture, estimate, colours.of_robot(number))
         canvas = self._canvas
         canvas[: self._height, : self._width] = picture
         canvas[: self._height, self._width :] = picture[:, -1:]
@@ -135,6 +138,13 @@ class Overlay:
         ring = self._robot_px + _RING_PX * unit
         restore(picture, clean, centre, ring)
         draw_outline(picture, centre + ring * CIRCLE, colour, _LINE_PX * unit)
+
+    def _draw_other(self, picture: Picture, estimate: Estimate, colour: colours.Rgb) -> None:
+        """The ring of a robot that is not the mission's."""
+        centre = self.zoom * (self._scene.to_plane(estimate.position_um) + np.array(shift_px(self._tick.shift))) - 0.5
+        if drawable(centre):
+            ring = centre + (self._robot_px + _RING_PX * self._unit) * CIRCLE
+            draw_outline(picture, ring, colour if estimate.seen else colours.PALE, _LINE_PX * self._unit)
 
 
 def _content_key(tick: Tick) -> tuple[object, ...]:

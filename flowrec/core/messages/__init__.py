@@ -9,7 +9,7 @@ Points are (x, y); arrays are [row, column] = [y, x]. Stamps are nanoseconds on 
 """
 
 from flowrec.core.messages.control import AxesCheck, Currents, Demand, Event, Mission
-from flowrec.core.messages.estimation import Estimate, Health, Observations
+from flowrec.core.messages.estimation import WALLS, Estimate, Health, Observations, RobotWalls
 from flowrec.core.messages.rig import (
     PIXEL_BITS,
     Applied,
@@ -45,6 +45,7 @@ __all__ = [
     "SAMPLES",
     "SILENT",
     "STREAMS",
+    "WALLS",
     "Appearance",
     "Applied",
     "AxesCheck",
@@ -62,6 +63,7 @@ __all__ = [
     "Observations",
     "OperatorEvent",
     "PumpShare",
+    "RobotWalls",
     "Route",
     "Samples",
     "Shift",

@@ -80,6 +80,22 @@ class Health(Message):
     ] = NOT_STATED
 
 
+WALLS = "/robots/walls"  # path of the topic
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotWalls(Message):
+    """Distance of each robot but the first one from the walls, in the order of their numbers from 1 on."""
+
+    stamp_ns: int
+    wall_um: Annotated[
+        Vector, Shape("n", finite=False), "distance from its surface to the nearest wall; NaN: it is not in view"
+    ]
+    near: Annotated[Vector, Shape("n"), "1: it is so near to the wall that there is an alarm"]
+    towards_um_s: Annotated[Vector, Shape("n"), "speed at which the command of the tick before drives it to that wall"]
+    limit_um_s: Annotated[float | None, "limit of the first robot's speed for their sake; None: none"] = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations(Message):
     """Local flow measured along the robot's way: the data of a refinement.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -105,21 +105,22 @@ class EmulatedWorld(SimulatedRig):
         """The flow in which the robot swims."""
         return self.true_world().field
 
-    def _advance(self, swimmer: Swimmer, until_ns: int) -> NDArray[np.float64]:
+    def _advance(self, swimmers: Sequence[Swimmer], until_ns: int) -> NDArray[np.float64]:
         time.sleep(max(0.0, seconds(self.began_ns + until_ns + _LATE_NS - time.monotonic_ns())))
         rolled = self.rolled
         rolled.take()
         again_s = self.again_after_s
         if rolled.energised and again_s is not None and rolled.off_s(self.began_ns + until_ns) > again_s:
             rolled.let_go()
-            swimmer.position_um, swimmer.gone = np.array(self._start_um), False
+            swimmers[0].position_um, swimmers[0].gone = np.array(self._start_um), False
         ends = np.append(np.arange(self._now_ns, until_ns, _PIECE_NS), until_ns)
         if not rolled.energised or len(ends) < 2:  # the robot is let go when the coils hold it
             return np.zeros(2)
         turns = rolled.until(ends + self.began_ns)
         for lasts_s, (x, y) in zip(np.diff(ends) / NS_PER_S, np.diff(turns, axis=0), strict=True):
             turned = float(np.hypot(x, y))
-            swimmer.advance(float(lasts_s), turned / float(lasts_s), float(np.arctan2(y, x)), float(turned > 0.0))
+            for swimmer in swimmers:
+                swimmer.advance(float(lasts_s), turned / float(lasts_s), float(np.arctan2(y, x)), float(turned > 0.0))
         return np.asarray(turns[-1] - turns[0])
 
 

@@ -112,6 +112,7 @@ class Swimmer:
     field, clearance_um : the steady flow; (h, w) from pixel centres to walls.
     pump : of the flow; None: made of `simulated`.
     hindrance : drag of the side walls.
+    rng : of its noise; None: that of the first robot of the seed.
     """
 
     def __init__(
@@ -124,6 +125,7 @@ class Swimmer:
         um_per_px: float,
         pump: Pump | None = None,
         hindrance: Hindrance = NO_HINDRANCE,
+        rng: np.random.Generator | None = None,
     ) -> None:
         self.position_um = np.array(position_um, np.float64)
         self.contacts = 0
@@ -142,7 +144,7 @@ class Swimmer:
         self._field = field
         self._clearance = clearance_um
         self._um_per_px = um_per_px
-        self._rng = np.random.default_rng([simulated.seed, 1])
+        self._rng = np.random.default_rng([simulated.seed, 1]) if rng is None else rng
         self._wander = np.zeros(2)  # heading, speed: in standard deviations
         self._run(0.0, 0.0, 0.0, np.zeros((0, 2)))  # compiles, so that the second frame is not late
 

@@ -14,17 +14,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import Image, compiled, pixel_type
+from flowrec.core import Floats, Image, compiled, pixel_type
 from flowrec.physics import Calibration, clearance_um
 from flowrec.stages import CameraSettings, Optics, SimulatedImage
 
 _POOL = 1 << 20  # normal numbers drawn once; an image takes its noise from them at random offsets
+_DARKNESS = 0.8  # of the robot of the mission
 _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
 
 
@@ -102,6 +104,15 @@ def _expose(
             out[x] = min(max(grey * scale + half, low), high)
 
 
+class DrawnRobot(NamedTuple):
+    """A robot in an image."""
+
+    position_um: Floats  # (2,)
+    radius_um: float
+    velocity_um_s: Floats  # (2,)
+    darkness: float  # from 0 to 1
+
+
 class Microscope:
     """Renders frames.
 
@@ -149,10 +160,12 @@ class Microscope:
         debris_radii_um: NDArray[np.float64],
         debris_darkness: NDArray[np.float64],
         stage_um: NDArray[np.float64] | None = None,
+        others: Sequence[DrawnRobot] = (),
     ) -> Image:
         """One frame (h, w): the robot (None: not there) over the debris (n, 2), at the middle of the exposure.
 
-        `stage_um` (2,) is how far the stage, and all that is on it, has moved; None: not at all.
+        `stage_um` (2,) is how far the stage, and all that is on it, has moved; None: not at all. `others` are the other
+        robots in view. Where two lie over each other the light is that through both.
         """
         if stage_um is not None:
             shift = self._calibration.vectors_to_px(stage_um)
@@ -170,10 +183,15 @@ class Microscope:
                 strict=True,
             )
         ]
+        robots = [
+            each._replace(position_um=each.position_um + (0.0 if stage_um is None else stage_um)) for each in others
+        ]
         if robot_um is not None:
-            place = self._calibration.to_px(robot_um).tolist()
-            smear = self._calibration.vectors_to_px(robot_velocity_um_s * self._camera.exposure_s).tolist()
-            windows.append(self._particle(self._scene, place, robot_radius_um, 0.8, smear))
+            robots.append(DrawnRobot(robot_um, robot_radius_um, robot_velocity_um_s, _DARKNESS))
+        for each in robots:
+            place = self._calibration.to_px(each.position_um).tolist()
+            smear = self._calibration.vectors_to_px(each.velocity_um_s * self._camera.exposure_s).tolist()
+            windows.append(self._particle(self._scene, place, each.radius_um, each.darkness, smear))
         height, width = self._scene.shape
         camera = self._camera
         image = np.empty((height, width), pixel_type(camera.bits))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Self
@@ -35,6 +35,7 @@ from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.beads import Beads
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.others import OtherRobot, other_robots
 from flowrec.rigs.simulated.pump_sensor import PumpSensor
 from flowrec.rigs.simulated.world import (
     Shake,
@@ -234,10 +235,8 @@ class SimulatedRig:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
         world = self.true_world()
         field, walls = world.field, world.clearance_um
-        radius, seed, px = self._robot.radius_um, self._simulated.seed, self._chip.um_per_px
-        swimmer = Swimmer(
-            self._start_um, self._true_robot, self._simulated, field, walls, px, self.pump, world.hindrance
-        )
+        radius, seed = self._robot.radius_um, self._simulated.seed
+        swimmer, others = self._swimmers(world)
         debris = Debris(self._chip, self._simulated.image.debris, radius, field, walls, seed)
         microscope = self._microscope()
         depth_um = true_depth_um(self._chip, self._simulated, radius)
@@ -254,7 +253,7 @@ class SimulatedRig:
         while index < self._frames:
             stamp = round(index * NS_PER_S / self._rate_hz)
             before = swimmer.position_um
-            turns = self._advance(swimmer, stamp)
+            turns = self._advance([swimmer, *others], stamp)
             elapsed = seconds(stamp - self._now_ns)
             if elapsed > 0:
                 debris.drift(elapsed)
@@ -268,6 +267,7 @@ class SimulatedRig:
                 radii,
                 darkness,
                 None if self._shake is None else self._shake.at(seconds(stamp)),
+                [each.look(elapsed) for each in others if not each.gone],
             )
             arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
             if self._realtime:
@@ -287,8 +287,17 @@ class SimulatedRig:
                 true_field=field if index == 0 else None,
                 true_tracers=beads.truth(stamped) if self._simulated.tracers else None,
                 clock=fit,
+                extra=dict(each.truth(stamped) for each in others),
             )
             index += 1
+
+    def _swimmers(self, world: World) -> tuple[Swimmer, list[OtherRobot]]:
+        """The robot of the mission and the others, at their starts."""
+        robot, simulated, start_um, px = self._true_robot, self._simulated, self._start_um, self._chip.um_per_px
+        field, walls, pump, hindrance = world.field, world.clearance_um, self.pump, world.hindrance
+        first = Swimmer(start_um, robot, simulated, field, walls, px, pump, hindrance)
+        common = {"field": field, "pump": pump, "hindrance": hindrance}
+        return first, other_robots(self._chip, robot, simulated, start_um, walls, **common)
 
     def tried(self) -> Generator[Inputs]:
         """Run on a copy of this rig with the same world and camera; a later run does not depend on it."""
@@ -307,7 +316,7 @@ class SimulatedRig:
             self._world = world_of(self._chip, self._robot, self._simulated, self._given, clear_um)
         return self._world
 
-    def _advance(self, swimmer: Swimmer, until_ns: int) -> NDArray[np.float64]:
+    def _advance(self, swimmers: Sequence[Swimmer], until_ns: int) -> NDArray[np.float64]:
         """Advance the world to a stamp; the field changes exactly when commands take effect. Returns the turns (2,)."""
         turns = np.zeros(2)
         now = self._now_ns
@@ -319,37 +328,37 @@ class SimulatedRig:
             end = min(max(switch, now), until_ns)
             lasts_s = seconds(end - now)
             if lasts_s and self._acting is None:
-                self._move(swimmer, lasts_s, 0.0, 0.0, 0.0)
+                self._move(swimmers, lasts_s, 0.0, 0.0, 0.0)
             elif lasts_s and self._acting is not None:
-                turns += self._turn(swimmer, self._acting, lasts_s)
+                turns += self._turn(swimmers, self._acting, lasts_s)
             now = end
             if not (self._coming and self._coming[0][0] <= now):
                 return turns
             self._acting = self._coming.pop(0)[1]
 
-    def _turn(self, swimmer: Swimmer, command: Currents, duration_s: float) -> NDArray[np.float64]:
-        """Let the field turn, and the robot with it, as control/field_rotation.py describes. Returns the turns (2,)."""
+    def _turn(self, swimmers: Sequence[Swimmer], command: Currents, duration_s: float) -> NDArray[np.float64]:
+        """Let the field turn, and the robots with it, as control/field_rotation.py has it. Returns the turns (2,)."""
         way = field_motion(self._rotation, _order(command))
         self._rotation = way.after(duration_s)
         turns = np.zeros(2)
         full_mt = self._coils.amplitude_mt if self._coils is not None else 0.0
         strength = min(command.amplitude_mt / full_mt, 1.0) if full_mt > 0.0 else float(command.amplitude_mt > 0.0)
         for leg in way.segments(duration_s):
-            self._move(swimmer, leg.duration_s, leg.frequency_hz, leg.heading_rad, strength)
+            self._move(swimmers, leg.duration_s, leg.frequency_hz, leg.heading_rad, strength)
             if strength > 0.0:
                 heading = np.array([math.cos(leg.heading_rad), math.sin(leg.heading_rad)])
                 turns += leg.frequency_hz * leg.duration_s * heading
         return turns
 
     def _move(
-        self, swimmer: Swimmer, duration_s: float, frequency_hz: float, heading_rad: float, strength: float
+        self, swimmers: Sequence[Swimmer], duration_s: float, frequency_hz: float, heading_rad: float, strength: float
     ) -> None:
-        """Let the robot move, unless it is held."""
+        """Let the robots move, but the first one only while nothing holds it."""
+        swimmer, *others = swimmers
+        true_rad, part = (heading_rad, 1.0) if self._true_coils is None else self._true_coils.motion(heading_rad)
+        for each in others if self._hold is not None else swimmers:
+            each.advance(duration_s, frequency_hz, true_rad, strength * part)
         if self._hold is None:
-            if self._true_coils is not None:
-                heading_rad, part = self._true_coils.motion(heading_rad)
-                strength *= part
-            swimmer.advance(duration_s, frequency_hz, heading_rad, strength)
             return
         swimmer.wait(duration_s)
         left_s, before = self._hold

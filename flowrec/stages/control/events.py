@@ -15,6 +15,7 @@ from flowrec.core import (
     HEARD,
     SILENT,
     STREAMS,
+    WALLS,
     Action,
     Alarm,
     AxesVerdict,
@@ -27,6 +28,7 @@ from flowrec.core import (
     OperatorEvent,
     Outcome,
     Phase,
+    RobotWalls,
     StreamStates,
     Tick,
     seconds,
@@ -53,6 +55,7 @@ def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | 
         *_hand(last, tick),
         *_axes(last, tick),
         *_streams(last, tick),
+        *_others(last, tick),
         *_mission(last, tick),
     ]
     if not lines:
@@ -229,6 +232,18 @@ def _streams(last: Tick, tick: Tick) -> Iterator[Line]:
             yield f"stream {name} is back", None
         if steps > steps_before:
             yield f"stream {name}: the sender's clock has stepped; its stamps are shifted", Level.WARNING
+
+
+def _others(last: Tick, tick: Tick) -> Iterator[Line]:
+    """Robots other than the mission's one that come near to a wall, or are off it again."""
+    walls, before = tick.extra.get(WALLS), last.extra.get(WALLS)
+    if not isinstance(walls, RobotWalls) or walls is before:
+        return
+    was = before.near if isinstance(before, RobotWalls) else np.zeros_like(walls.near)
+    for number in np.flatnonzero(walls.near > was).tolist():
+        yield f"robot {number + 1} is {max(walls.wall_um[number], 0.0):.0f} um from a wall", Level.WARNING
+    for number in np.flatnonzero(walls.near < was).tolist():
+        yield f"alarm over: robot {number + 1} near a wall", None
 
 
 def _mission(last: Tick, tick: Tick) -> Iterator[Line]:

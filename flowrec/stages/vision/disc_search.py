@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,32 +56,9 @@ class DiscSearch:
 
 def best_disc(image: Image | NDArray[np.float32], walls: Walls, search: DiscSearch) -> Disc | None:
     """The best disc within the search range."""
-    x0, y0, x1, y1 = search.box
-    if x1 <= x0 or y1 <= y0:
-        return None
-    nominal = search.nominal_px
-    step = coarse_step(nominal)
-    clearance = 0.7 * nominal - search.slack_px
-    match = masked_ncc(image, walls.distance_px, search.box, step, search.margin_px, clearance, template(nominal, step))
-    rows, columns = match.shape
-    offset = 0.5 * (step - 1)
     near = math.isfinite(search.range_px)
-    if near:
-        dx = x0 + offset - search.centre[0] + step * np.arange(columns, dtype=np.float32)
-        dy = y0 + offset - search.centre[1] + step * np.arange(rows, dtype=np.float32)
-        distance2 = ((dx * dx)[None] + (dy * dy)[:, None]) / np.float32(search.range_px**2)
-        match = np.where(distance2 <= 1.0, match - np.float32(_DISTANCE_PENALTY) * distance2, np.float32(-1.0))
     best, best_rank = None, 0.0
-    suppressed = max(1, round(nominal / step))  # around a candidate
-    for _ in range(search.candidates):
-        row, column = divmod(int(match.argmax()), columns)
-        if match[row, column] < _LEAST_CORRELATION:
-            break
-        top, left = max(row - suppressed, 0), max(column - suppressed, 0)
-        match[top : row + suppressed + 1, left : column + suppressed + 1] = -1.0
-        found = _measure(image, walls, x0 + offset + step * column, y0 + offset + step * row, search)
-        if found is None or found.score < search.least_score or found.likeness < search.least_likeness:
-            continue
+    for found in discs(image, walls, search):
         rank = found.score * found.darkness
         if near:
             moved2 = (found.x - search.centre[0]) ** 2 + (found.y - search.centre[1]) ** 2
@@ -90,6 +68,34 @@ def best_disc(image: Image | NDArray[np.float32], walls: Walls, search: DiscSear
         if near and found.score > _SURE:
             break
     return best
+
+
+def discs(image: Image | NDArray[np.float32], walls: Walls, search: DiscSearch) -> Iterator[Disc]:
+    """The discs within the search range that are like a robot, the most similar ones to its template first."""
+    x0, y0, x1, y1 = search.box
+    if x1 <= x0 or y1 <= y0:
+        return
+    nominal = search.nominal_px
+    step = coarse_step(nominal)
+    clearance = 0.7 * nominal - search.slack_px
+    match = masked_ncc(image, walls.distance_px, search.box, step, search.margin_px, clearance, template(nominal, step))
+    rows, columns = match.shape
+    offset = 0.5 * (step - 1)
+    if math.isfinite(search.range_px):
+        dx = x0 + offset - search.centre[0] + step * np.arange(columns, dtype=np.float32)
+        dy = y0 + offset - search.centre[1] + step * np.arange(rows, dtype=np.float32)
+        distance2 = ((dx * dx)[None] + (dy * dy)[:, None]) / np.float32(search.range_px**2)
+        match = np.where(distance2 <= 1.0, match - np.float32(_DISTANCE_PENALTY) * distance2, np.float32(-1.0))
+    suppressed = max(1, round(nominal / step))  # around a candidate
+    for _ in range(search.candidates):
+        row, column = divmod(int(match.argmax()), columns)
+        if match[row, column] < _LEAST_CORRELATION:
+            break
+        top, left = max(row - suppressed, 0), max(column - suppressed, 0)
+        match[top : row + suppressed + 1, left : column + suppressed + 1] = -1.0
+        found = _measure(image, walls, x0 + offset + step * column, y0 + offset + step * row, search)
+        if found is not None and found.score >= search.least_score and found.likeness >= search.least_likeness:
+            yield found
 
 
 def _measure(image: Image | NDArray[np.float32], walls: Walls, x: float, y: float, search: DiscSearch) -> Disc | None:

@@ -10,6 +10,7 @@ which are assigned one by one: the cost is linear in the number of bodies as lon
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -82,18 +83,20 @@ class TracerTracker:
         calibration: Calibration,
         robot: Robot,
         shift_px: tuple[float, float] = (0.0, 0.0),
+        others: Sequence[Track] = (),
     ) -> Tracers:
         """The tracers in this frame. `track` is the robot's in the same frame, whose image no tracer is a part of.
 
-        `shift_px` (columns, rows): how far the image lies from where the calibration holds.
+        `shift_px` (columns, rows): how far the image lies from where the calibration holds. `others`: of other robots.
         """
         walls = walls_in_view(chip, calibration, frame.image.shape)
         if any(shift_px):
             walls, calibration = walls.for_shift(shift_px), calibration.for_shift(shift_px)
         px, _ = self.search(calibration.um_per_px, robot).find(frame.image, walls)
-        if track is not None and track.seen and len(px):
-            apart_px = np.hypot(*(px - calibration.to_px(track.position_um)).T)
-            px = px[apart_px > _NEAR_ROBOT_RADII * max(track.radius_px, robot.radius_um / calibration.um_per_px)]
+        for each in (track, *others):
+            if each is not None and each.seen and len(px):
+                apart_px = np.hypot(*(px - calibration.to_px(each.position_um)).T)
+                px = px[apart_px > _NEAR_ROBOT_RADII * max(each.radius_px, robot.radius_um / calibration.um_per_px)]
         spots_um = calibration.to_um(px).reshape(-1, 2)
         now_s, next_id = seconds(frame.stamp_ns), 0
         std_um, dt = _STD_PX * calibration.um_per_px, 0.0
@@ -127,10 +130,12 @@ class TracerTracker:
         )
 
 
-def assign(expected: Floats, variance: Floats, spots: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def assign(
+    expected: Floats, variance: Floats, spots: Floats, unlike: Floats | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The assignment of spots to bodies: indices (k,) of bodies expected at (n, 2), and of their spots (m, 2).
 
-    `variance` (n,) is that of the distance per component.
+    `variance` (n,) is that of the distance per component, `unlike` (n, m) what the look of a spot adds to the cost.
     """
     import scipy.optimize  # not at start-up
     import scipy.spatial
@@ -146,9 +151,12 @@ def assign(expected: Floats, variance: Floats, spots: Floats) -> tuple[NDArray[n
     # A body that is missed costs the limit of its gate, so the terms of S are left that tell bodies of one spot apart.
     cost = ((spots[columns] - expected[rows]) ** 2).sum(axis=1) / variance[rows] - _GATE
     cost += 2.0 * np.log(variance[rows] / variance.max())
+    if unlike is not None:
+        cost += unlike[rows, columns]
     alone = (np.bincount(rows, minlength=len(expected))[rows] == 1) & (
         np.bincount(columns, minlength=len(spots))[columns] == 1
     )
+    alone &= cost < 1.0  # beyond that a body is rather missed
     found = [(rows[alone], columns[alone])]
     rows, columns, cost = rows[~alone], columns[~alone], cost[~alone]
     if len(rows):

@@ -13,12 +13,13 @@ Learned appearance (learned.py): for a robot that a user has pointed at, and for
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
 
-from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, seconds
+from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, UsageError, seconds
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.disc_search import (
     LARGEST,
@@ -46,6 +47,7 @@ from flowrec.stages.vision.learned import (
     with_motion,
 )
 from flowrec.stages.vision.learning import box_of, brightest_spot, energy_of, learn, pixel_noise
+from flowrec.stages.vision.several import Expected, Sought, first_tracks, next_tracks
 from flowrec.stages.vision.tracers import TracerTracker
 from flowrec.stages.vision.trackers import TRACKERS, TrackingMethod
 from flowrec.stages.vision.walls import Box, Walls, walls_in_view
@@ -133,8 +135,26 @@ class Tracker:
     click_frame: Annotated[int, Range(0, 2**62)] | None = None  # index of the image of click_px; None: the first one
     # the walls of the mask may be off by this many robot radii; ignored where polarity is None
     wall_error_radii: Annotated[float, Range(0.0, 2.0)] = 0.5
+    # robots that are followed: the mission's one, which is the nearest to its start, and others in the same field
+    robots: Annotated[int, Range(1, 100)] = 1
+    # a point (column, row) on each robot in the first image, the mission's one first; (): the most similar discs
+    robots_px: tuple[tuple[_Pixel, _Pixel], ...] = ()
     tracers: bool = False  # tracks of all bodies but the robot: beads that drift show the flow
     tracer: TracerTracker = field(default_factory=TracerTracker)
+
+    @property
+    def count(self) -> int:
+        """Number of robots that are followed."""
+        return max(self.robots, len(self.robots_px))
+
+    def refuse_unfit(self) -> None:
+        """Raise UsageError where settings are for one robot, and several are followed."""
+        given = {"method": self._other, "click_px": self.click_px, "box_px": self.box_px}
+        if self.count > 1 and (names := [name for name, value in given.items() if value is not None]):
+            raise UsageError(
+                f"tracker.{names[0]} is for one robot, and {self.count} are to be followed; leave it out "
+                "(tracker.robots_px names a point on each)"
+            )
 
     @property
     def _other(self) -> TrackingMethod | None:
@@ -189,6 +209,40 @@ class Tracker:
         search = self._plan(scene)
         return scene.track(search, self._dark_disc(scene, search, appearance.noise)), appearance
 
+    def follow_all(
+        self,
+        previous: Sequence[Track],
+        expected: Sequence[Expected],
+        appearance: Appearance | None,
+        frame: Frame,
+        chip: Chip,
+        calibration: Calibration,
+        robot: Robot,
+        shift_px: tuple[float, float],
+        start_um: Floats,
+    ) -> tuple[list[Track], Appearance]:
+        """All robots in this frame, the first one first, and the look of all; `expected` is where each one should be.
+
+        Before the first image `previous` is empty. Then the first robot is the one that is nearest to `start_um`.
+        """
+        walls = walls_in_view(chip, calibration, frame.image.shape)
+        if any(shift_px):
+            walls, calibration = walls.for_shift(shift_px), calibration.for_shift(shift_px)
+        search = self._plan(_Scene(None, frame, walls, calibration, robot), everywhere=True)
+        if appearance is None:
+            look = "bright" if self.polarity == "bright" else "dark"
+            middle, nothing = 0.5 * (np.array(frame.image.shape[::-1]) - 1.0), np.zeros((0, 1, 1), np.float32)
+            noise = pixel_noise(frame.image) / 2 ** (frame.bits - 8)
+            appearance = Appearance(frame.stamp_ns, look, noise, 0.0, search.nominal_px, middle, nothing)
+        image = frame.image if frame.bits == 8 else frame.image.astype(np.float32) / np.float32(2 ** (frame.bits - 8))
+        image = image if appearance.polarity == "dark" else np.float32(255.0) - image.astype(np.float32)
+        fixed = (self.least_score, self.search_px, self.reacquire_after, appearance.noise)
+        sought = Sought(frame, image, walls, calibration, robot, search, *fixed)
+        if previous:
+            return next_tracks(sought, previous, expected), appearance
+        at_um = [calibration.to_um(px) for px in self.robots_px] or [start_um]
+        return first_tracks(sought, self.count, at_um), appearance
+
     def track(self, previous: Track | None, frame: Frame, chip: Chip, calibration: Calibration, robot: Robot) -> Track:
         """The dark disc in this frame; `seen` False keeps the last position (the image's centre before the first)."""
         walls = walls_in_view(chip, calibration, frame.image.shape)
@@ -198,7 +252,7 @@ class Tracker:
 
     def footprint(self, chip: Chip, calibration: Calibration, robot: Robot, shape: tuple[int, int]) -> Footprint:
         """The pixels of an image of `shape` that can influence a track, whatever the image shows."""
-        if self._other is not None or self.tracers:
+        if self._other is not None or self.tracers or self.count > 1:
             return Footprint(max(shape), (0, 0, shape[1], shape[0]))
         pad_px = disc_pad_px(robot.radius_um / calibration.um_per_px)
         if self.polarity is not None:

@@ -1,0 +1,127 @@
+"""Several robots that touch or hide each other in an image: all of them are fitted at once.
+
+The light that passes is the product of what each robot lets through,
+
+    I = b prod_k (1 - a_k disc(s_k) + 0.35 a_k rim(s_k)),    s_k = (|p - x_k| - r_k) / e_k,
+
+with disc and rim of disc_fit.py; radius r and darkness a of each are known from when it was alone. The places x are
+those of largest posterior probability, from where each robot is expected with a variance. Where one hides another, a
+small error of the model decides how far they seem apart; so their distance is kept as expected, and they are moved as
+one. Among all ways to exchange the robots that is kept whose cost is least, so that their looks tell them apart where
+their ways do not.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import Floats
+from flowrec.stages.vision.disc_fit import RIM_RATIO, initial_edge_px
+from flowrec.stages.vision.walls import Walls
+
+_STEEPNESS, _RIM_POSITION, _RIM_WIDTH = 2.2, 2.0, 1.1  # as in disc_fit.py
+_ITERATIONS = 6  # of the Gauss-Newton steps
+_PERMUTED = 3  # robots at most whose exchange is tried: six ways
+_HIDDEN = 0.5  # of the sum of two radii: nearer robots hide each other
+_MISFIT = 0.1  # of the background: standard deviation of a pixel about the model, whose neighbours err alike
+_ALIKE_PX = 9.0  # pixels that err alike
+_BOX_RADII = 1.8  # around the robots
+_LEVEL = 0.8  # quantile of the grey levels around robots: the background
+_LEAST_PIXELS = 4  # a robot
+_SHARES = (0.05, 0.98)  # least and most light that a robot takes
+_LEAST_VARIANCE_PX2 = 1e-6  # of an expected place
+_FINE_RADIUS_PX = 6.0  # of the robot in pixels that are looked at, unless it is smaller
+_LEAST_LIKENESS = 0.6  # sqrt(1 - residual / variance), below which the image does not show these robots
+
+
+class Body(NamedTuple):
+    """A robot that is expected in an image, in camera px and grey levels."""
+
+    expected_px: Floats  # (2,)
+    variance_px2: float  # of that, per component
+    radius_px: float
+    darkness: float
+
+
+class _Image(NamedTuple):
+    """Pixels of an image around robots, in the fluid."""
+
+    pixels: Floats  # (m, 2) column and row
+    grey: Floats  # (m,)
+    level: float  # of the background
+    weight: float  # of the square of a grey level
+
+
+def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodies: list[Body]) -> Floats | None:
+    """Places (n, 2) in px of robots that touch each other; None if the image does not show them."""
+    expected, radii = np.array([body.expected_px for body in bodies]), np.array([body.radius_px for body in bodies])
+    part = _part_of(image, walls, margin_px, expected, radii)
+    if part is None or len(part.grey) < _LEAST_PIXELS * len(bodies):
+        return None
+    share = np.clip([body.darkness / part.level for body in bodies], *_SHARES)
+    precision = np.array([1.0 / max(body.variance_px2, _LEAST_VARIANCE_PX2) for body in bodies])
+    apart = np.hypot(*(expected[:, None] - expected).transpose(2, 0, 1)) / (radii[:, None] + radii)
+    as_one = bool((apart[np.triu_indices(len(bodies), 1)] < _HIDDEN).any())
+    as_they_are = [tuple(range(len(bodies)))]
+    orders = as_they_are if as_one or len(bodies) > _PERMUTED else itertools.permutations(range(len(bodies)))
+    moves = np.tile(np.eye(2), (len(bodies), 1)) if as_one else np.eye(2 * len(bodies))
+    best, least, residual = expected, np.inf, np.inf
+    for order in orders:
+        places = expected[list(order)].copy()
+        for _ in range(_ITERATIONS):
+            model, slopes = _light(part.pixels, places, radii, share)
+            off = part.grey - part.level * model
+            jacobian = part.level * slopes.reshape(len(off), -1)
+            normal = part.weight * jacobian.T @ jacobian + np.diag(np.repeat(precision, 2))
+            slope = part.weight * jacobian.T @ off - (precision[:, None] * (places - expected)).ravel()
+            move = (moves @ np.linalg.solve(moves.T @ normal @ moves, moves.T @ slope)).reshape(-1, 2)
+            longest = np.hypot(*move.T) / (0.5 * radii)  # a step is half a radius at most
+            places += move / np.maximum(longest, 1.0)[:, None]
+        left = float(((part.grey - part.level * _light(part.pixels, places, radii, share)[0]) ** 2).sum())
+        cost = part.weight * left + float((precision[:, None] * (places - expected) ** 2).sum())
+        if cost < least:
+            best, least, residual = places, cost, left
+    variance = float(((part.grey - part.level) ** 2).sum())
+    shown = residual <= (1.0 - _LEAST_LIKENESS**2) * variance
+    return best if shown and np.isfinite(best).all() else None
+
+
+def _part_of(
+    image: NDArray[np.generic], walls: Walls, margin_px: float, expected: Floats, radii: Floats
+) -> _Image | None:
+    """The part of an image around robots; None where it is too small."""
+    x0, y0 = np.floor((expected - _BOX_RADII * radii[:, None]).min(axis=0)).astype(int)
+    x1, y1 = np.ceil((expected + _BOX_RADII * radii[:, None]).max(axis=0)).astype(int) + 1
+    (left, top), (right, bottom) = np.maximum((x0, y0), 0), np.minimum((x1, y1), image.shape[::-1])
+    if right <= left or bottom <= top:
+        return None
+    step = max(1, int(radii.min() / _FINE_RADIUS_PX))
+    rows, columns = np.mgrid[top:bottom:step, left:right:step]
+    free = walls.distance_px[rows, columns] > margin_px
+    if not free.any():
+        return None
+    pixels = np.column_stack((columns[free], rows[free])).astype(np.float64)
+    grey = image[rows[free], columns[free]].astype(np.float64)
+    level = max(float(np.quantile(grey, _LEVEL)), 1.0)
+    return _Image(pixels, grey, level, step**2 / (_ALIKE_PX * (_MISFIT * level) ** 2))
+
+
+def _light(pixels: Floats, places: Floats, radii: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Light (m,) that passes, of the background's, and its derivatives (m, n, 2) in the places (n, 2)."""
+    away = pixels[:, None] - places
+    rho = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-6)
+    edges = np.array([initial_edge_px(float(radius)) for radius in radii])
+    s = (rho - radii) / edges
+    disc = 1.0 / (1.0 + np.exp(np.clip(_STEEPNESS * s, -40.0, 40.0)))
+    off = (s - _RIM_POSITION) / _RIM_WIDTH
+    rim = RIM_RATIO * np.exp(-(off**2))
+    passed = 1.0 - share * (disc - rim)
+    by_s = share * (_STEEPNESS * disc * (1.0 - disc) - 2.0 * off / _RIM_WIDTH * rim)
+    light = passed.prod(axis=1)
+    # s falls as the robot comes nearer: ds / dx = -away / (rho e).
+    slopes = (light[:, None] / passed * by_s / (rho * edges))[..., None] * -away
+    return light, slopes

@@ -1,0 +1,168 @@
+"""Robots beside the mission's one: expectation, response, walls, the limit of speed; and what a stage may not know."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from flowrec.core import WALLS, Applied, Demand, Estimate, RobotWalls, Source, Tick, Topic, Track, Truth
+from flowrec.core.topics import Extra
+from flowrec.physics import Robot, clearance_um, load_chip
+from flowrec.rigs import SimulatedRig
+from flowrec.run import LockstepWorker, run
+from flowrec.stages import assemble, load_config, resolve, robot_topic
+from flowrec.stages.control.events import event_of
+from flowrec.stages.estimation import Observer
+from flowrec.stages.other_robots import OtherRobots, expected_robots, observe_others
+from flowrec.stages.pipeline import step
+from flowrec.stages.robot_topics import messages_of, robot_number, robot_topics
+from tests.short_missions import SMALL
+
+ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=28.0)
+MASK = np.zeros((40, 60), bool)
+MASK[10:30] = True
+UM = 20.0
+CLEARANCE = clearance_um(MASK, UM)
+SEVERAL = [*SMALL, "simulated.robots=3", "tracker.robots=3", "simulated.seed=4"]
+MIDDLE_UM, FLOOR_UM = 390.0, 590.0  # of the channel; its lower wall, in +y
+
+
+def estimate(y_um: float, um_per_rev: float = 25.0, flow=(0.0, 0.0), stamp_ns: int = 0) -> Estimate:
+    flow_um_s = np.array(flow)
+    place = np.array([600.0, y_um])
+    return Estimate(stamp_ns, place, flow_um_s, np.eye(4), 2.0, place, True, um_per_rev=um_per_rev)
+
+
+def track(y_um: float, *, seen: bool = True, stamp_ns: int = 0) -> Track:
+    return Track(stamp_ns, seen, np.array([600.0, y_um]), 0.9, 0, 5.0, np.zeros(4), seen_ns=stamp_ns if seen else None)
+
+
+def walls(y_um: float, velocity=(0.0, 0.0), settings=OtherRobots(), before: RobotWalls | None = None) -> RobotWalls:  # noqa: B008
+    demand = Demand(0, np.array(velocity), np.full(2, math.nan), 0.0, 0.0, False, np.zeros((0, 2)))
+    last = Tick(demand=demand, extra=Extra({} if before is None else {WALLS: before}))
+    return settings.watch(last, [track(y_um)], [estimate(y_um, 50.0)], ROBOT, [50.0], CLEARANCE, UM)
+
+
+def test_the_distance_is_from_the_surface_and_the_speed_that_of_the_robots_own_response() -> None:
+    told = walls(FLOOR_UM - 90.0, (30.0, 40.0))
+    assert told.wall_um[0] == pytest.approx(40.0, abs=1.0)
+    assert told.towards_um_s[0] == pytest.approx(80.0), "it rolls twice as far as the mission's robot"
+    assert walls(FLOOR_UM - 90.0, (30.0, -40.0)).towards_um_s[0] == pytest.approx(-80.0)
+
+
+def test_the_alarm_begins_below_a_distance_and_ends_farther_off() -> None:
+    settings = OtherRobots(near_um=40.0)
+    far = walls(FLOOR_UM - 95.0, settings=settings)
+    near = walls(FLOOR_UM - 85.0, settings=settings)
+    assert (far.near[0], near.near[0]) == (0.0, 1.0)
+    assert walls(FLOOR_UM - 95.0, settings=settings, before=near).near[0] == 1.0
+    assert walls(FLOOR_UM - 130.0, settings=settings, before=near).near[0] == 0.0
+    ticks = [Tick(extra=Extra({WALLS: each})) for each in (far, near, far)]
+    said = [event_of(a, b) for a, b in pairwise(ticks)]
+    assert "robot 1 is 35 um from a wall" in said[0].text and "alarm over: robot 1" in said[1].text
+
+
+@pytest.mark.parametrize(
+    ("y_um", "velocity", "limited"),
+    [
+        (FLOOR_UM - 70.0, (0.0, 90.0), True),
+        (FLOOR_UM - 70.0, (0.0, -90.0), False),  # away from the wall
+        (MIDDLE_UM, (0.0, 90.0), False),  # far from it
+    ],
+)
+def test_the_speed_is_limited_only_while_a_robot_is_near_a_wall_and_driven_there(y_um, velocity, limited) -> None:
+    assert walls(y_um, velocity).limit_um_s is None, "no limit unless one is set"
+    told = walls(y_um, velocity, OtherRobots(speed_limit_um_s=70.0))
+    assert told.limit_um_s == (70.0 if limited else None)
+
+
+def test_of_a_robot_that_is_not_in_view_nothing_is_told() -> None:
+    unseen = track(FLOOR_UM - 60.0, seen=False)
+    settings = OtherRobots(speed_limit_um_s=70.0)
+    demand = Demand(0, np.array([0.0, 90.0]), np.full(2, math.nan), 0.0, 0.0, False, np.zeros((0, 2)))
+    told = settings.watch(Tick(demand=demand), [unseen], [estimate(FLOOR_UM - 60.0)], ROBOT, [50.0], CLEARANCE, UM)
+    assert math.isnan(told.wall_um[0]) and told.near[0] == 0.0 and told.limit_um_s is None
+
+
+def test_a_robot_is_expected_where_flow_and_its_own_um_per_revolution_take_it() -> None:
+    dt_ns = 100_000_000
+    extra = Extra(messages_of(1, track(390.0), estimate(390.0, 40.0, (50.0, 0.0))))
+    last = Tick(stamp_ns=0, track=track(300.0), estimate=estimate(300.0), extra=extra)
+    applied = Applied(dt_ns, 10.0, 0.0, 5.0, np.zeros(3), np.array([1.0, 0.5]))
+    first, other = expected_robots(last, 2, applied, dt_ns, ROBOT)
+    np.testing.assert_allclose(first.position_um, [625.0, 312.5])
+    np.testing.assert_allclose(other.position_um, [600.0 + 40.0 + 5.0, 390.0 + 20.0])
+
+
+def test_an_observer_of_each_finds_its_um_per_revolution_where_the_heading_varies() -> None:
+    true_um_per_rev, dt, place = 31.0, 1.0 / 30.0, np.array([600.0, 390.0])
+    flow = np.array([40.0, -15.0])
+    last = Tick()
+    for index in range(400):
+        heading = 2.0 * math.pi * index / 60.0
+        turns = 8.0 * dt * np.array([math.cos(heading), math.sin(heading)])
+        place = place + (true_um_per_rev * turns + flow * dt if index else 0.0)
+        stamp_ns = round(index * dt * 1e9)
+        applied = Applied(stamp_ns, 8.0, heading, 5.0, np.zeros(3), turns)
+        seen = replace(track(0.0, stamp_ns=stamp_ns), position_um=place)
+        (found,) = observe_others(Observer(method="kalman"), last, [seen], applied, ROBOT, None)
+        last = Tick(stamp_ns=stamp_ns, extra=Extra(messages_of(1, seen, found)))
+    assert found.um_per_rev == pytest.approx(true_um_per_rev, rel=0.02)
+    np.testing.assert_allclose(found.flow_um_s, flow, atol=4.0)
+
+
+def test_topics_are_those_of_the_first_robot_with_a_number() -> None:
+    config = load_config(None, SEVERAL)
+    topics = {topic.path: topic for topic in robot_topics(config)}
+    assert set(topics) == {
+        *("/robot/1/track", "/robot/1/estimate", "/robot/2/track", "/robot/2/estimate"),
+        *("/robots/walls", "/truth/robot/1", "/truth/robot/2"),
+    }
+    assert topics["/robot/2/track"].type is Track and topics["/truth/robot/1"].source is Source.SIMULATOR
+    assert [robot_number(path) for path in ("/robot/12/track", "/robot/track", "/truth/robot/3", "/robots/walls")] == [
+        *(12, 0, 3, 0)
+    ]
+    assert not list(robot_topics(load_config(None, SMALL)))
+    assert isinstance(topics["/robot/1/estimate"], Topic)
+
+
+def test_no_stage_reads_the_truth_of_a_robot() -> None:
+    config = load_config(None, SEVERAL)
+    chip = load_chip(config.chip)
+    config = resolve(config, chip)
+    pipeline = assemble(config, chip)
+    rig = SimulatedRig.of(pipeline, config, duration_s=1.0)
+    true, other = Tick(), Tick()
+    for inputs in rig.inputs():
+        true = step(pipeline, true, inputs)
+        lied = {path: replace(told, position_um=told.position_um + 500.0) for path, told in inputs.extra.items()}
+        assert lied and all(isinstance(told, Truth) for told in lied.values())
+        other = step(pipeline, other, replace(inputs, extra=lied))
+        for number in (1, 2):
+            path = robot_topic("/robot/estimate", number)
+            np.testing.assert_array_equal(true.extra[path].position_um, other.extra[path].position_um)
+        np.testing.assert_array_equal(true.extra[WALLS].wall_um, other.extra[WALLS].wall_um)
+    assert "/truth/robot/1" not in true.extra
+
+
+def test_a_limit_slows_the_command_while_a_robot_is_near_a_wall() -> None:
+    """The frequency that is sent, in a mission in which the others are near walls all the time."""
+    fastest = {}
+    for limit in (None, 60.0):
+        sets = [*SEVERAL, "others.near_um=1000", *([f"others.speed_limit_um_s={limit}"] if limit else [])]
+        config = load_config(None, sets)
+        chip = load_chip(config.chip)
+        config = resolve(config, chip)
+        pipeline = assemble(config, chip)
+        ticks: list[Tick] = []
+        rig = SimulatedRig.of(pipeline, config, duration_s=2.5)
+        run(pipeline, rig, LockstepWorker(pipeline, 0.3), [], on_tick=ticks.append)
+        told = [(tick.extra[WALLS].limit_um_s, math.hypot(*tick.demand.velocity_um_s)) for tick in ticks]
+        fastest[limit] = max(speed for _, speed in told)
+        assert all(speed <= 60.0 + 1e-6 for holds, speed in told if holds is not None)
+        assert (limit is None) or any(holds is not None and speed > 50.0 for holds, speed in told)
+    assert fastest[None] > 200.0
