@@ -28,7 +28,8 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.streams import Streams
 from flowrec.stages.config import load_config
 from flowrec.stages.extra_topics import TOPIC_ROWS, ExtraRow, topics_of
-from flowrec.stages.pipeline import Inputs, Pipeline
+from flowrec.stages.inputs import Inputs
+from flowrec.stages.pipeline import Pipeline
 from flowrec.stages.rig_settings import RIGS
 from flowrec.store.session import Session
 from flowrec.verbs.check import check

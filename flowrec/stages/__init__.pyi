@@ -35,10 +35,12 @@ from .outside_settings import (
     all_tables as all_tables, facts_of as facts_of, needed_packages as needed_packages, of_stages as of_stages,
     other_packages as other_packages, with_row as with_row,
 )
-from .pipeline import (
-    ARRIVING as ARRIVING, FROM_IMAGE as FROM_IMAGE, Inputs as Inputs, Pipeline as Pipeline, Sight as Sight,
-    assemble as assemble, look as look, recorded_extra as recorded_extra, step as step,
+from .inputs import (
+    ARRIVING as ARRIVING, FROM_IMAGE as FROM_IMAGE, Inputs as Inputs, recorded_extra as recorded_extra,
     with_inputs as with_inputs,
+)
+from .pipeline import (
+    Pipeline as Pipeline, Sight as Sight, assemble as assemble, look as look, step as step,
 )
 from .planning.eikonal import descend as descend, time_field as time_field
 from .planning.feasibility import no_room as no_room, swept_out as swept_out, too_swift as too_swift

@@ -20,7 +20,7 @@ from flowrec.core import FlowrecError, UsageError, append_line, say, table
 from flowrec.stages import Config, ResolvedConfig, to_toml
 from flowrec.store import Session
 from flowrec.verbs.protocol_day import Day
-from flowrec.verbs.protocol_hands import Hand
+from flowrec.verbs.protocol_hands import ProtocolHand
 from flowrec.verbs.protocol_rows import ROWS, ProtocolRow
 
 PASSED, FAILED, NOT_DONE = "pass", "fail", "not done"
@@ -101,7 +101,12 @@ class DayProtocol(NamedTuple):
 
 
 def walk(
-    asked: Config, file: Path | None, sets: Mapping[str, Any], folder: Path, hand: Hand, only: Iterable[str] = ()
+    asked: Config,
+    file: Path | None,
+    sets: Mapping[str, Any],
+    folder: Path,
+    hand: ProtocolHand,
+    only: Iterable[str] = (),
 ) -> DayProtocol:
     """Measure what has not passed yet, in order.
 

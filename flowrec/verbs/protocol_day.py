@@ -13,7 +13,7 @@ from flowrec.core import FlowrecError, say, start_child
 from flowrec.physics import load_chip
 from flowrec.stages import Config, ResolvedConfig, resolve
 from flowrec.store import Session
-from flowrec.verbs.protocol_hands import Hand, free_path
+from flowrec.verbs.protocol_hands import ProtocolHand, free_path
 
 
 class Day:
@@ -29,9 +29,11 @@ class Day:
     config : resolved on its chip.
     """
 
-    def __init__(self, asked: Config, file: Path | None, sets: Mapping[str, Any], folder: Path, hand: Hand) -> None:
+    def __init__(
+        self, asked: Config, file: Path | None, sets: Mapping[str, Any], folder: Path, hand: ProtocolHand
+    ) -> None:
         self.asked, self.folder = asked, folder
-        self.hand: Hand = hand
+        self.hand: ProtocolHand = hand
         self.config: ResolvedConfig = resolve(asked, load_chip(asked.chip))
         self.sessions: dict[str, Path] = {}  # by name of the run
         given = (f"{key}={json.dumps(value)}" for key, value in sets.items())

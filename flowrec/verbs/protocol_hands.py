@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 MOUNTED = "mounted"  # the answer by which nobody is asked
 
 
-class Hand(Protocol):
+class ProtocolHand(Protocol):
     """Hands and eyes, which a program does not have; `sees_zero`: somebody looks at an ammeter."""
 
     sees_zero: bool
@@ -113,7 +113,7 @@ class EmulatedHand(Answers):
         self._instruments.pull_cable(pulled=pulled)
 
 
-def hand_of(answers: Iterable[str], *, asks: bool) -> Hand:
+def hand_of(answers: Iterable[str], *, asks: bool) -> ProtocolHand:
     """A person, if somebody sits at the terminal and may be asked, or the answers alone."""
     return Person(answers) if asks and sys.stdin.isatty() and sys.stderr.isatty() else Answers(answers)
 

@@ -21,7 +21,7 @@ from flowrec.core.messages import SAMPLES, SILENT, STREAMS, Applied
 from flowrec.run.control import RunControl
 from flowrec.run.stream_inputs import StreamInputs
 from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.stages.stream_settings import STREAM_KINDS
 
 pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")

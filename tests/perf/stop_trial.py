@@ -24,7 +24,7 @@ from flowrec.core.messages import Currents
 from flowrec.rigs.simulated import rig as simulated
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run import loop
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.verbs import cli
 from flowrec.verbs import mission_run as verb
 from tests.short_missions import SMALL

@@ -21,7 +21,7 @@ from flowrec.core.messages import SAMPLES, STREAMS, Applied
 from flowrec.run.control import RunControl
 from flowrec.run.loop import SWITCH_S
 from flowrec.run.stream_inputs import StreamInputs
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.stages.stream_settings import StreamSettings
 
 STREAMS_OF = {"slow": (1.0, 1), "usual": (100.0, 1), "fast": (1000.0, 1), "wide": (1000.0, 32)}

@@ -15,7 +15,7 @@ from flowrec.core.messages import Applied, Currents, Event, Frame
 from flowrec.rigs.rig import checked_images
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.store.reader import SessionReader
 from flowrec.verbs import session_replay as replay
 from flowrec.verbs.record import record

@@ -20,7 +20,7 @@ from flowrec.rigs.streams.log import RunLog
 from flowrec.run.control import RunControl
 from flowrec.run.stream_inputs import StreamInputs
 from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.stages.stream_settings import StreamSettings
 from flowrec.store.session import Session
 from flowrec.verbs.record import record

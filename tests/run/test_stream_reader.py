@@ -22,7 +22,7 @@ from flowrec.run.control import RunControl
 from flowrec.run.stream_inputs import StreamInputs
 from flowrec.run.stream_reader import StreamReader
 from flowrec.stages.control.events import event_of
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.stages.stream_settings import StreamSettings
 
 PERIOD_NS = 10_000_000  # of 100 Hz

@@ -10,7 +10,8 @@ import pytest
 import flowrec
 from flowrec.core.enums import Outcome, Phase
 from flowrec.physics import sample
-from flowrec.stages.pipeline import Inputs, assemble, step
+from flowrec.stages.inputs import Inputs
+from flowrec.stages.pipeline import assemble, step
 
 
 @pytest.fixture(scope="module")

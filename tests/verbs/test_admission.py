@@ -19,7 +19,7 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.control import RunControl
 from flowrec.run.workers import LockstepWorker
 from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.verbs import admission
 from flowrec.verbs.admission import Held, admit
 from flowrec.verbs.interactive import Unattended

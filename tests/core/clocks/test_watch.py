@@ -21,7 +21,7 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
 from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import Inputs
+from flowrec.stages.inputs import Inputs
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session import Session
