@@ -81,7 +81,7 @@ def judge(key: str, hint: Any, default: Any) -> None:
         default = (0.0, 0.0)
     if key == "tracker.box_px":
         default = (0.0, 0.0, 0.0, 0.0)
-    if key == "robot.speed_at_hz":
+    if key in ("robot.speed_at_hz", "tracker.robots_px"):
         default = ((5.0, 100.0),)
     if key.endswith((".rates_1_s", ".ratios")):
         default = (1.0,)
