@@ -137,7 +137,7 @@ class Tracker:
     wall_error_radii: Annotated[float, Range(0.0, 2.0)] = 0.5
     # robots that are followed: the mission's one, which is the nearest to its start, and others in the same field
     robots: Annotated[int, Range(1, 100)] = 1
-    # a point (column, row) on each robot in the first image, the mission's one first; (): the most similar discs
+    # a point (column, row) on each robot in the first image, the mission's one first; []: the most similar discs
     robots_px: tuple[tuple[_Pixel, _Pixel], ...] = ()
     tracers: bool = False  # tracks of all bodies but the robot: beads that drift show the flow
     tracer: TracerTracker = field(default_factory=TracerTracker)
