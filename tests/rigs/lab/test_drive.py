@@ -308,7 +308,7 @@ def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
         (amplifier("serial", serial.address), strong, "coils.max_current_a = 7 A: flowrec-coils makes at most 5 A"),
         (amplifier("ni", "127.0.0.1:1"), COILS, "no NI gRPC Device Server"),
         (amplifier("serial", serial.address, coils=SIX_COILS), SIX_COILS, "drives 3 coils, where coils.mt_per_a has 6"),
-        (amplifier("ni", ni.address, coils=SIX_COILS), SIX_COILS, "the device has no such output"),
+        (amplifier("ni", ni.address, coils=SIX_COILS), SIX_COILS, "the device has no such channel"),
     ]
     for given, coils, words in cases:
         with (

@@ -161,7 +161,7 @@ def outputs_in_use(on: Device) -> Iterator[tuple[str, ...]]:
         ("serial", 1, other_words, (), "another device than flowrec-coils answers"),
         ("serial", 1, port_in_use, (), "another program uses this port"),
         ("ni", 1, outputs_in_use, (), "another program uses the outputs"),
-        ("ni", 1, nothing_else, ('lab.ni.channels="cDAQ1Mod1/ao7:9"',), "the device has no such output"),
+        ("ni", 1, nothing_else, ('lab.ni.channels="cDAQ1Mod1/ao7:9"',), "the device has no such channel"),
     ],
 )
 def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_file_and_no_field(
