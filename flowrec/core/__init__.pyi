@@ -98,7 +98,7 @@ from .system.outputs import (
 from .system.processes import (
     Priority as Priority, forget_peak as forget_peak, peak_mb as peak_mb, pool as pool, prioritise_process as prioritise_process,
     prioritise_thread as prioritise_thread, realtime_priority as realtime_priority,
-    start_child as start_child,
+    interrupted_too as interrupted_too, start_child as start_child,
 )
 from .system.regular_file import (
     make_own_folder as make_own_folder, own_temporary_folder as own_temporary_folder,

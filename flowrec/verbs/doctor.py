@@ -94,16 +94,16 @@ def doctor(
 
     if not protocol and (answers or only):
         raise MisuseError("--answer and --only are for --protocol")
+    settings = settings_of(sets or ()) | ({"rig": rig} if rig is not None else {})
     if protocol:
         from flowrec.verbs.protocol import walk
         from flowrec.verbs.protocol_hands import hand_of
 
-        given = settings_of(sets or ()) | ({"rig": rig} if rig is not None else {})
         hand = hand_of(answers or (), asks=at_terminal)
-        return walk(load_config(config, given, {"rig": "--rig"}), config, given, folder or Path(), hand, only or ())
+        chosen = load_config(config, settings, {"rig": "--rig"})
+        return walk(chosen, config, settings, folder or Path(), hand, only or ())
     from flowrec.verbs.diagnosis import diagnose, of_devices
 
-    settings = settings_of(sets or ()) | ({"rig": rig} if rig is not None else {})
     wrong = ""
     try:
         chosen = load_config(config, settings, {"rig": "--rig"})

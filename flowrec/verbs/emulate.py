@@ -1,6 +1,5 @@
 """`flowrec emulate NAME`: verbs that start devices which this computer does not have."""
 
-import signal
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Union
@@ -100,18 +99,14 @@ def lab(
 
 def _fly(made: "EmulatedLab", session: Path, overwrite: bool) -> Flown:
     """Record a mission in a process of its own, as a person in another terminal would."""
-    from flowrec.core import start_child
+    from flowrec.core import interrupted_too, start_child
 
     words = ["record", str(made.file), "--out", str(session), *(["--overwrite"] if overwrite else [])]
     say(f"flowrec {' '.join(words)}")
     began_s = time.time()
     recorder = start_child("flowrec", *words, stdin=None, stdout=None)
-    try:
+    with interrupted_too(recorder):
         status = recorder.wait()
-    except KeyboardInterrupt:
-        recorder.send_signal(signal.SIGINT)  # in a session of its own, it has not seen Ctrl-C
-        recorder.wait()  # it completes its file, and has its own limits for the rest
-        raise
     if not session.exists() or session.stat().st_mtime < began_s:  # refused; a file of before stays
         return Flown(None, status)
     from flowrec.store import Session

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from flowrec.core import FlowrecError, say, start_child
+from flowrec.core import FlowrecError, interrupted_too, say, start_child
 from flowrec.physics import load_chip
 from flowrec.stages import Config, ResolvedConfig, resolve
 from flowrec.store import Session
@@ -61,12 +60,8 @@ class Day:
         if name not in self.sessions:
             path = self.new_path(name)
             process = self.start(path, *sets)
-            try:
+            with interrupted_too(process):
                 said = process.communicate()[1].decode(errors="replace").strip().splitlines()
-            except BaseException:  # Ctrl-C, or a signal that ends this process
-                process.send_signal(signal.SIGINT)  # in a session of its own, it has not seen Ctrl-C
-                process.communicate()
-                raise
             if not path.exists():
                 raise FlowrecError(
                     f"flowrec record: {said[-1].removeprefix('flowrec: ') if said else 'it says nothing'}"

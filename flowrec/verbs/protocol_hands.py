@@ -125,6 +125,10 @@ def free_path(folder: Path, name: str, suffix: str) -> Path:
 
 
 def _ask(question: str) -> str:
+    """The answer of a person; UsageError where the terminal is closed (Ctrl-D), which is none."""
     sys.stderr.write(question)
     sys.stderr.flush()
-    return sys.stdin.readline().strip()
+    line = sys.stdin.readline()
+    if not line:
+        raise UsageError("the terminal is closed: nobody has answered")
+    return line.strip()

@@ -20,6 +20,9 @@ from flowrec.rigs.emulated.coils import FULL_A, OutputSamples, compiled_firmware
 _ROOT = Path(__file__).parents[2]
 
 
+needs_compiler = pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
+
+
 def compiled(folder: Path, timer_ms: int = 100, coils: int = 3, sensors: bool = False) -> Path:
     """The firmware as a program; a test is skipped where nothing can compile it."""
     if compiler() is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,19 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.errors import FlowrecError
+from flowrec.core.errors import FlowrecError, UsageError
 from flowrec.rigs.emulated.camera import EmulatedCamera
-from flowrec.rigs.emulated.coils import OutputSamples, compiler, sample
+from flowrec.rigs.emulated.coils import OutputSamples, sample
 from flowrec.rigs.emulated.instruments import EmulatedInstruments
 from flowrec.stages.config import load_config
 from flowrec.stages.control.coils import Coils
 from flowrec.store.session import Session
 from flowrec.verbs import protocol, ways_out
 from flowrec.verbs.protocol import FAILED, NOT_DONE, PASSED, RESULTS, DayProtocol, walk
-from flowrec.verbs.protocol_hands import Answers, EmulatedHand
+from flowrec.verbs.protocol_hands import Answers, EmulatedHand, Person
 from flowrec.verbs.protocol_rows import ROWS, RowValue
 from tests.conftest import needs_quiet, run
 from tests.short_missions import SMALL
+from tests.twins.coils import needs_compiler
 from tests.twins.lab import PATIENT
 
 NAMES = ["scale", "axes", "latency", "um_per_rev", "step_out", "field", "flow", "zero", "mission", "replay"]
@@ -206,6 +208,24 @@ def test_a_defect_of_the_simulated_world_fails_the_row_that_is_for_it(
     assert {each["result"] for name, each in found.items() if name != row} == {NOT_DONE}
 
 
+def test_a_person_says_what_is_ready_and_a_closed_terminal_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    def typed(*lines: str) -> Person:
+        monkeypatch.setattr("sys.stdin", io.StringIO("".join(lines)))
+        return Person(["field_table=probe.csv"])
+
+    assert typed("\n").ready("field", "a probe")
+    assert not typed("s\n").ready("field", "a probe")
+    assert (
+        typed().read("field_table", "File") == "probe.csv" and typed("zero.csv\n").read("other", "File") == "zero.csv"
+    )
+    assert typed("0.3\n").zero_after_s("Ctrl-C", 0, 2.0) == 0.3
+    for asked in (lambda: typed().ready("field", "a probe"), lambda: typed().pull_cable(pulled=True)):
+        with pytest.raises(UsageError, match="terminal is closed"):
+            asked()
+    with pytest.raises(UsageError, match="no number of seconds"):
+        typed("soon\n").zero_after_s("Ctrl-C", 0, 2.0)
+
+
 DEFECTS = {
     "the y coil is connected the other way round": (
         ("--world", "coils.mt_per_a=[[2.1,0.0,0.0],[0.0,-1.9,0.0],[0.0,0.0,1.5]]"),
@@ -219,14 +239,13 @@ DEFECTS = {
 }
 
 
+@needs_compiler
 @needs_quiet
 @pytest.mark.slow("flies missions in real time")
 @pytest.mark.parametrize("name", DEFECTS)
 def test_a_defect_of_an_emulated_lab_fails_the_row_that_is_for_it(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if compiler() is None:
-        pytest.skip("needs a C++ compiler")
     words, expected = DEFECTS[name]
     rows = ("scale", *expected) if "field" in expected else ("scale", "axes", "latency", "um_per_rev", "step_out")
     done = run_protocol(tmp_path, [*words, *(word for row in rows for word in ("--only", row))], capsys)
@@ -235,11 +254,10 @@ def test_a_defect_of_an_emulated_lab_fails_the_row_that_is_for_it(
     assert [row for row in rows if done[row] == FAILED] == [row for row in expected if expected[row] == FAILED], done
 
 
+@needs_compiler
 @needs_quiet
 @pytest.mark.slow("flies missions in real time")
 def test_on_an_emulated_lab_that_is_as_stated_all_ten_pass(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    if compiler() is None:
-        pytest.skip("needs a C++ compiler")
     assert run_protocol(tmp_path, [], capsys) == dict.fromkeys(NAMES, PASSED)
 
 

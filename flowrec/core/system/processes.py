@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -67,6 +68,17 @@ def start_child(
         **({"stdin": subprocess.PIPE, "stdout": subprocess.PIPE} | given),
     )
     return process
+
+
+@contextmanager
+def interrupted_too(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Context in which a child is waited for: what leaves it, such as Ctrl-C, interrupts the child, which may end."""
+    try:
+        yield
+    except BaseException:
+        process.send_signal(signal.SIGINT)  # in a session of its own, it has not seen Ctrl-C
+        process.communicate()  # it completes its file, and has its own limits for the rest
+        raise
 
 
 @contextmanager

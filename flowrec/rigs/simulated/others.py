@@ -111,11 +111,11 @@ def other_robots(
     away = np.hypot(*(places - start_um).T) / robot.radius_um
     near = places[(away > _NEAR_RADII) & (away < _FAR_RADII)]
     places = near if len(near) else places
+    common = {"clearance_um": clearance_um, "um_per_px": chip.um_per_px, **options}
     made: list[OtherRobot] = []
     for number in range(1, simulated.robots):
         x, y = places[int(rng.integers(len(places)))].tolist()
-        options_of_all = {"clearance_um": clearance_um, "um_per_px": chip.um_per_px, **options}
-        made.append(OtherRobot(number, (x, y), robot, simulated, **options_of_all))
+        made.append(OtherRobot(number, (x, y), robot, simulated, **common))
         left = places[np.hypot(*(places - (x, y)).T) > _APART_RADII * robot.radius_um]
         places = left if len(left) else places
     return made

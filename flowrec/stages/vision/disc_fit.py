@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from flowrec.core import Image, compiled
 
 RIM_RATIO = 0.35  # brightness of the rim relative to the disc's darkness, where nothing better is known
-_STEEPNESS = 2.2  # of the outline
-_RIM_POSITION, _RIM_WIDTH = 2.0, 1.1  # in edge widths outside the outline
+STEEPNESS = 2.2  # of the outline
+RIM_POSITION, RIM_WIDTH = 2.0, 1.1  # in edge widths outside the outline
 _X, _Y, _RADIUS, _EDGE, _LEVEL, _SLOPE_X, _SLOPE_Y, _DARKNESS, _RIM = range(9)
 _PARAMETERS = 9  # those above
 _ITERATIONS = 10  # at most, of the damped Gauss-Newton
@@ -32,10 +32,10 @@ _LARGE = 1e200  # before the product of many factors overflows, its logarithm is
 @compiled
 def profile(s: float) -> tuple[float, float, float, float]:
     """Disc (1 inside, 0 outside) and rim at s edge widths outside the outline, and their derivatives in s."""
-    disc = 1.0 / (1.0 + math.exp(min(max(_STEEPNESS * s, -40.0), 40.0)))
-    off = (s - _RIM_POSITION) / _RIM_WIDTH
+    disc = 1.0 / (1.0 + math.exp(min(max(STEEPNESS * s, -40.0), 40.0)))
+    off = (s - RIM_POSITION) / RIM_WIDTH
     rim = math.exp(-off * off)
-    return disc, rim, -_STEEPNESS * disc * (1.0 - disc), -2.0 * off / _RIM_WIDTH * rim
+    return disc, rim, -STEEPNESS * disc * (1.0 - disc), -2.0 * off / RIM_WIDTH * rim
 
 
 def initial_edge_px(radius_px: float) -> float:

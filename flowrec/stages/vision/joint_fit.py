@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import Floats
-from flowrec.stages.vision.disc_fit import RIM_RATIO, initial_edge_px
+from flowrec.stages.vision.disc_fit import RIM_POSITION, RIM_RATIO, RIM_WIDTH, STEEPNESS, initial_edge_px
 from flowrec.stages.vision.walls import Walls
 
-_STEEPNESS, _RIM_POSITION, _RIM_WIDTH = 2.2, 2.0, 1.1  # as in disc_fit.py
 _ITERATIONS = 6  # of the Gauss-Newton steps
 _PERMUTED = 3  # robots at most whose exchange is tried: six ways
 _HIDDEN = 0.5  # of the sum of two radii: nearer robots hide each other
@@ -116,11 +115,11 @@ def _light(pixels: Floats, places: Floats, radii: Floats, share: Floats) -> tupl
     rho = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-6)
     edges = np.array([initial_edge_px(float(radius)) for radius in radii])
     s = (rho - radii) / edges
-    disc = 1.0 / (1.0 + np.exp(np.clip(_STEEPNESS * s, -40.0, 40.0)))
-    off = (s - _RIM_POSITION) / _RIM_WIDTH
+    disc = 1.0 / (1.0 + np.exp(np.clip(STEEPNESS * s, -40.0, 40.0)))
+    off = (s - RIM_POSITION) / RIM_WIDTH
     rim = RIM_RATIO * np.exp(-(off**2))
     passed = 1.0 - share * (disc - rim)
-    by_s = share * (_STEEPNESS * disc * (1.0 - disc) - 2.0 * off / _RIM_WIDTH * rim)
+    by_s = share * (STEEPNESS * disc * (1.0 - disc) - 2.0 * off / RIM_WIDTH * rim)
     light = passed.prod(axis=1)
     # s falls as the robot comes nearer: ds / dx = -away / (rho e).
     slopes = (light[:, None] / passed * by_s / (rho * edges))[..., None] * -away

@@ -24,7 +24,7 @@ from flowrec.core.topics import Tick
 from flowrec.measure.calibrate_motion import calibrate_motion
 from flowrec.rigs.emulated import coils as emulated_coils
 from flowrec.rigs.emulated.camera import EmulatedCamera
-from flowrec.rigs.emulated.coils import OutputSamples, compiled_firmware, compiler, sample
+from flowrec.rigs.emulated.coils import OutputSamples, compiled_firmware, sample
 from flowrec.rigs.emulated.world import Rolled
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
@@ -39,6 +39,7 @@ from flowrec.store.session import Session
 from flowrec.verbs.session_replay import replay_session
 from tests.conftest import needs_quiet, run, until
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, currents
+from tests.twins.coils import needs_compiler
 from tests.twins.lab import PATIENT, words
 
 SIZE = {"width_px": 64, "height_px": 48, "rate_hz": 40.0}
@@ -194,12 +195,11 @@ def test_the_chain_of_latency_is_the_sum_of_its_stages_and_is_told_with_median_a
     assert RunStatistics().latency is None, "a rig that does not tell has none"
 
 
+@needs_compiler
 @needs_quiet
 def test_the_command_starts_devices_that_the_doctor_finds_ready_and_ends_them_with_ctrl_c(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if compiler() is None:
-        pytest.skip("needs a C++ compiler")
     file = tmp_path / "lab.toml"
     command = [sys.executable, "-m", "flowrec", "emulate", "lab", "-o", str(file), "--set", "recording.admission_s=0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
@@ -219,13 +219,12 @@ def test_the_command_starts_devices_that_the_doctor_finds_ready_and_ends_them_wi
     assert not file.exists()
 
 
+@needs_compiler
 @needs_quiet
 @pytest.mark.slow("flies a mission in real time")
 def test_a_mission_on_the_emulated_lab_arrives_states_its_latency_and_gives_back_the_delay_of_the_camera(
     tmp_path: Path,
 ) -> None:
-    if compiler() is None:
-        pytest.skip("needs a C++ compiler")
     session, delay_s = tmp_path / "s.mcap", 0.03
     command = [
         sys.executable,
