@@ -25,24 +25,27 @@ def fit_of(**values: float | bool) -> MotionFit:
     return MotionFit(**(given | {"offset_s": -LATE_S, "heading_offset_rad": HEADING_OFF} | values))  # type: ignore[arg-type]
 
 
-def track_in(frequencies_hz: np.ndarray, speed: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def track_in(
+    frequencies_hz: np.ndarray, speed: np.ndarray, rng: np.random.Generator, mirrored: bool = False
+) -> tuple[np.ndarray, ...]:
     """Times, positions and log of a robot that has these speeds, in fields of a second each and any heading."""
     headings = rng.uniform(0.0, 2.0 * np.pi, len(frequencies_hz))
     log = FieldLog(np.arange(len(headings)) * 10**9, frequencies_hz, headings, np.full(len(headings), 4.0))
     time_s = np.arange(0.0, len(headings) - 1.0, 1.0 / RATE_HZ)
     now = np.maximum(np.floor(time_s - LATE_S), 0.0).astype(int)
-    course = headings[now] + HEADING_OFF
+    course = HEADING_OFF + (-headings[now] if mirrored else headings[now])
     steps = speed[now, None] * np.column_stack([np.cos(course), np.sin(course)]) / RATE_HZ
     positions = np.cumsum(steps, axis=0) + rng.normal(0.0, 0.5, (len(now), 2))
     return time_s, positions, log
 
 
-def test_the_speeds_of_a_robot_that_is_slower_per_revolution_at_high_frequencies_are_found() -> None:
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_speeds_of_a_robot_that_is_slower_per_revolution_at_high_frequencies_are_found(mirrored: bool) -> None:
     rng = np.random.default_rng(1)
     frequencies_hz = rng.choice([4.0, 8.0, 12.0, 16.0], 240)
     speed = np.interp(frequencies_hz, [0.0, 4.0, 8.0, 12.0, 16.0], [0.0, 100.0, 180.0, 230.0, 250.0])
-    time_s, positions, log = track_in(frequencies_hz, speed, rng)
-    found = fit_speed_table(time_s, positions, lambda at_s: log.turns_until(at_s * 1e9), fit_of())
+    time_s, positions, log = track_in(frequencies_hz, speed, rng, mirrored)
+    found = fit_speed_table(time_s, positions, lambda at_s: log.turns_until(at_s * 1e9), fit_of(mirrored=mirrored))
     assert not found.why_not
     hz, um_s = np.array(found.pairs).T
     assert np.all(np.diff(hz) > 0.0) and np.all(np.diff(um_s) > 0.0) and hz[-1] > 15.0

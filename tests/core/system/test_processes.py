@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.system.processes import realtime_priority
+from flowrec.core.system.processes import interrupted_too, realtime_priority
 from tests.conftest import until
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="a matter of Linux")
@@ -67,3 +67,15 @@ def test_where_it_is_not_allowed_the_run_goes_on_as_it_is(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     with realtime_priority() as granted:
         assert not granted
+
+
+def test_what_interrupts_the_wait_for_a_child_interrupts_the_child_which_may_complete_its_work(tmp_path: Path) -> None:
+    code = (
+        "import sys, time\ntry:\n    print('ready', flush=True)\n    time.sleep(60)\n"
+        f"except KeyboardInterrupt:\n    time.sleep(0.3)\n    open({str(tmp_path / 'whole')!r}, 'w').close()\n"
+    )
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, start_new_session=True)
+    assert child.stdout is not None and child.stdout.readline() == b"ready\n"
+    with pytest.raises(KeyboardInterrupt), interrupted_too(child):
+        raise KeyboardInterrupt
+    assert child.returncode == 0 and (tmp_path / "whole").exists()
