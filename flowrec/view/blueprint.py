@@ -18,7 +18,7 @@ from flowrec.view.entities import FRAME, SESSION_TIME, entity_path, points
 from flowrec.view.maps import ColourBar
 from flowrec.view.scene import Box, Scene
 
-_SEVERAL_LINES = frozenset({e.POSITION, e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
+_SEVERAL_LINES = frozenset({e.POSITION, e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING, e.READ_BACK})
 _OVERLAYS = (e.OUTLINE, e.PATH, e.ROBOT)  # of each map, for orientation
 _SUMMARY = 0.31  # width of the text panel
 _SMALL = 0.42  # of all beside a camera without maps
@@ -281,6 +281,7 @@ def _plots(v: _Views) -> tuple[Part, ...]:
             None if single and told else frequency,
             v.plot("Heading (°)", e.HEADING),
             v.plot("Field (mT)", e.AMPLITUDE),
+            v.plot("Measured less put out (A)", e.READ_BACK),
         ),
         _row("Timing", v.plot("Timing (ms)", e.TIMING)),
         _row("Other topics", *(v.plot(entity.removeprefix(e.EXTRA), entity) for entity in extra[:_MOST_EXTRA])),

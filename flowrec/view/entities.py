@@ -56,6 +56,7 @@ NOT_YET = "not yet"  # beside a map that comes later in the session
 AMPLITUDE = "coils/amplitude"
 FREQUENCY = "coils/frequency"
 HEADING = "coils/heading"
+READ_BACK = "coils/read-back"  # currents as measured less those put out, of an amplifier that measures them
 TRACKING_ERROR = "robot/tracking error"
 POSITION = "robot/position"  # where no flow is told of
 ESTIMATE_ERROR = "robot/estimate error"
@@ -75,7 +76,9 @@ LANES = (PHASE, ALARM, MARKS, LOSSES, SIGHT)
 LANES_OF_RUN = (MARKS, LOSSES, SIGHT)  # the same in a replay
 EXTRA = "extra"  # before the path of an extra topic and the field of its message
 # A session may lack these: a layout shows those that were logged.
-OPTIONAL = frozenset({*SCALES, *LANES, POSITION, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING, TRACERS, OTHERS})
+OPTIONAL = frozenset(
+    {*SCALES, *LANES, POSITION, TRACKING_ERROR, ESTIMATE_ERROR, PULSATION, TIMING, TRACERS, OTHERS, READ_BACK}
+)
 SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"

@@ -9,23 +9,18 @@ import numpy as np
 import rerun as rr
 
 from flowrec.core import (
-    ALARM_WORDS,
-    NS_PER_S,
     SAMPLES,
     STREAMS,
-    Action,
-    Alarm,
     Applied,
-    CameraLosses,
     Currents,
     Demand,
-    Drops,
     Estimate,
     Event,
     Floats,
     Frame,
     Health,
     Level,
+    Measured,
     Message,
     Mission,
     OperatorEvent,
@@ -34,8 +29,7 @@ from flowrec.core import (
     Tick,
     Timing,
     Tracers,
-    Track,
-    completes_mission,
+    coil_names,
     message_fields,
     seconds,
     with_micro,
@@ -44,86 +38,10 @@ from flowrec.physics import sample
 from flowrec.stages import estimates_of_others, robot_number, tells_flow
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
-from flowrec.view.colours import Rgb
 from flowrec.view.drawing import CIRCLE, CROSS, NOMINAL_PX, Trail, WindowCompleter, encode_jpeg
 from flowrec.view.entities import ColumnBuffer, EntityLogger, label, points
 from flowrec.view.scene import Scene, goal_of, place_on_chip, way_of
-
-_MARK_NS = NS_PER_S // 2  # a mark is drawn this long: it has no duration
-_STATES = 200  # of a lane that have a colour of their own: a session of hours may have many marks
-_PHASES = 9  # that have a name in `StateLogger.phases`
-_WITH_TEXT = (Action.MARK, Action.NOTE, Action.GOAL, Action.SPEED)
-_LETTERS = 40  # of a mark's text
-_NONE = ""  # a state that is not drawn
-
-
-class StateLogger:
-    """Logs the timeline of states: mission, sight of the robot, alarms, marks and losses of images.
-
-    Only changes are logged; a lane that never had a state is not logged.
-    """
-
-    def __init__(self, entities: EntityLogger, *, doubtful: bool) -> None:
-        self._log = entities.log
-        self.doubtful = doubtful  # the result: its outcome is amber
-        self.phases: dict[str, int] = {}  # stamp at which each phase, and the outcome, first began
-        self._now: dict[str, str] = {}
-        self._colours: dict[str, dict[str, Rgb]] = {}  # of the states of each lane so far
-        self._mark_ends_ns: int | None = None
-
-    def log(self, message: Message) -> None:
-        """Log the state that a new message tells, if it tells one."""
-        match message:
-            case Mission():
-                self._log_mission(message)
-            case Track():
-                self._log_state(e.SIGHT, _NONE if message.seen else "Not seen", colours.RED)
-            case Health():
-                # That the robot is not seen has a lane of its own.
-                alarms = [name for name in message.alarm.split("; ") if name and name != Alarm.TRACKING]
-                self._log_state(e.ALARM, ", ".join(ALARM_WORDS.get(name, name) for name in alarms), colours.RED)
-            case OperatorEvent(action=action, text=said):
-                text = f"{action} {said}" if action in (Action.GOAL, Action.SPEED) else said
-                self._mark_ends_ns = message.stamp_ns + _MARK_NS
-                self._log_state(e.MARKS, text[:_LETTERS] if action in _WITH_TEXT and said else action, colours.CYAN)
-            case Drops(kept_every=every) if message.by_backlog or message.by_camera or every > 1:
-                thinned = f", every {every}. kept" if every > 1 else ""
-                self._log_state(e.LOSSES, f"{message.by_backlog + message.by_camera} lost{thinned}", colours.RED)
-            case CameraLosses() if message.ids > message.frames:
-                self._log_state(e.LOSSES, f"{message.ids - message.frames} lost before the loop", colours.RED)
-
-    def _log_mission(self, mission: Mission) -> None:
-        """The phase, and at the end the outcome."""
-        name, colour = mission.phase, colours.OF_PHASE.get(mission.phase, colours.GREY)
-        if mission.finished and mission.outcome:
-            name = mission.outcome
-            done = completes_mission(name)
-            colour = colours.RED if not done else colours.YELLOW if self.doubtful else colours.GREEN
-        if len(self.phases) < _PHASES:
-            self.phases.setdefault(name, mission.since_ns)
-        self._log_state(e.PHASE, name.capitalize(), colour)
-
-    def end_marks(self, stamp_ns: int) -> None:
-        """End a mark whose time is over."""
-        if self._mark_ends_ns is not None and stamp_ns >= self._mark_ends_ns:
-            self._mark_ends_ns = None
-            self._log_state(e.MARKS, _NONE, colours.CYAN)
-
-    def _log_state(self, lane: str, state: str, colour: Rgb) -> None:
-        if state == self._now.get(lane, _NONE):
-            return
-        self._now[lane] = state
-        known = self._colours.setdefault(lane, {_NONE: colour})
-        if state not in known and len(known) < _STATES:
-            known[state] = colour
-            shown = rr.StateConfiguration(
-                values=list(known),
-                colors=list(known.values()),
-                visible=[value != _NONE for value in known],
-            )
-            self._log(lane, shown, static=True)
-        self._log(lane, rr.StateChange(state=state))
-
+from flowrec.view.state_lanes import StateLogger
 
 _JPEG_QUALITY = 85  # 0 to 100, of OpenCV's encoder
 _TRAIL_STEP_PX = 1.0  # of NOMINAL_PX, between two points of the robot's trail
@@ -131,7 +49,7 @@ _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 _SHOWN = (  # fields of a tick, in the order in which they are logged
     *("route", "mission", "track", "estimate", "demand", "applied", "currents"),
-    *("health", "timing", "event", "operator", "drops", "losses", "tracers"),
+    *("health", "timing", "event", "operator", "drops", "losses", "tracers", "measured"),
 )
 _TRACER_S = 0.3  # way of a tracer that its arrow shows
 _LEAST_AGE = 3  # images that show a tracer before it is drawn
@@ -174,7 +92,7 @@ class TickLogger:
         self._flow = maps.FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds)
         self._tick = self._last = Tick()
         self._tells_flow = True
-        self._named: dict[str, int] = {}  # number of lines of the plots of streams
+        self._named: dict[str, int] = {}  # number of lines of the plots whose number a run decides
         left, _, right, _ = scene.image_bounds()
         self._unit_px = (right - left) / NOMINAL_PX
         self._trail = Trail(_TRAIL_STEP_PX * self._unit_px)
@@ -239,6 +157,10 @@ class TickLogger:
             case Currents() if not self._observes:
                 # The currents themselves oscillate at this frequency, too fast to be drawn from a sample a frame.
                 self._log_field(message)
+            case Measured():
+                coils = len(message.currents_a)
+                self._lines(e.READ_BACK, [f"coil {name} (A)" for name in coil_names(coils)])
+                self._scalars(e.READ_BACK, *(message.currents_a - message.put_out_a))
             case Health():
                 if math.isfinite(message.nis):
                     self._scalars(e.NIS_MEAN, message.nis)
@@ -277,10 +199,14 @@ class TickLogger:
             stream, _, channel = name.partition("/")
             lines.setdefault(f"{e.EXTRA}/streams/{stream}", {})[channel] = float(value)
         for entity, values in lines.items():
-            if self._named.get(entity) != len(values):
-                self._named[entity] = len(values)
-                self._log(entity, rr.SeriesLines(names=list(values)), static=True)
+            self._lines(entity, list(values))
             self._scalars(entity, *values.values())
+
+    def _lines(self, entity: str, names: list[str]) -> None:
+        """Name the lines of a plot whose number a run decides; a stream may have a channel more later."""
+        if self._named.get(entity) != len(names):
+            self._named[entity] = len(names)
+            self._log(entity, rr.SeriesLines(names=names), static=True)
 
     def _log_image(self, frame: Frame) -> None:
         if self._style.second or frame.image.size == 0:  # the images of two sessions are those of the first

@@ -12,7 +12,7 @@ import rerun as rr
 
 from flowrec.console.page_state import SHOWN, PageState
 from flowrec.core.enums import Outcome
-from flowrec.core.messages import Applied, FlowField, Shift
+from flowrec.core.messages import Applied, FlowField, Measured, Shift
 from flowrec.core.topics import Tick
 from flowrec.physics.chip.registration import Calibration
 from flowrec.physics.flow.sampling import sample
@@ -213,6 +213,15 @@ def test_a_window_is_shown_in_the_last_whole_image_dimmed() -> None:
     assert np.all(shown[10:20, 30:45] == 90)
     shown[10:20, 30:45] = 120
     assert np.all(shown == 120)
+
+
+def test_what_an_amplifier_puts_out_wrongly_is_seen_as_the_difference_of_each_coil(scene: Scene) -> None:
+    record = Record()
+    logger = TickLogger(record, scene)  # type: ignore[arg-type]
+    logger.log(Tick(0, measured=Measured(0, np.array([0.5, -1.0, 0.0, 0.25]), np.array([0.5, -0.5, 0.0, 0.5]))))
+    drawn = record.logged["/coils/read-back"].scalars.as_arrow_array().to_pylist()
+    assert np.allclose(np.ravel(drawn), [0.0, -0.5, 0.0, -0.25])
+    assert "coils/read-back" in logger.present  # the layout has a plot for it
 
 
 def test_image_and_robot_lie_on_the_chip_once_the_refinement_found_the_registration(
