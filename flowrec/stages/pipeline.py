@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -98,9 +99,8 @@ class Pipeline:
 
 def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     """The stages of a resolved configuration on its chip."""
-    inertia, tracers = config.flow.convection, config.tracker.tracers
     config.tracker.refuse_unfit()
-    config.pump.refuse_unfit(chip, config.streams, inertia=inertia, tracers=tracers)
+    config.pump.refuse_unfit(chip, config.streams, inertia=config.flow.convection)
     return Pipeline(
         chip=chip,
         calibration=calibration_of(config, chip),
@@ -287,7 +287,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     """
     p = pipeline
     tick = with_inputs(last, inputs, p.topics)
-    pump = p.pump.follow(last, tick)
+    pump = p.pump.follow(last, tick, p.tracker.tracer.stretch_s if p.tracker.tracers else 0.0)
     flow, route = at_pump(tick.field, pump), tick.route
     sight = _find_robot(p, last, inputs)
     track, appearance = sight.track, sight.appearance
@@ -332,7 +332,10 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         walls = p.others.watch(last, sight.others, others, p.robot, radii_um, p.clearance_um, p.chip.um_per_px)
         told = messages_of_others(sight.others, others, walls)
         tick = replace(tick, extra=tick.extra.with_messages(told))
-    tracer_flow = collect_stretches(last.tracer_flow, last.tracers, sight.tracers) if p.tracker.tracers else None
+    tracer_flow = None
+    if p.tracker.tracers:
+        at_nominal = None if pump is None else partial(p.pump.stretches_at_nominal, pump)
+        tracer_flow = collect_stretches(last.tracer_flow, last.tracers, sight.tracers, at_nominal)
     lap("observe")
     axes, driven_um_s = _axes(p, last, tick, track, rolled)
     hand_share = _hand_share(inputs)

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.declarations import Matrix, Message, Shape, Vector
+from flowrec.core.declarations import NOT_STATED, Matrix, Message, Shape, Vector
 
 SAMPLES, STREAMS, PUMP = "/streams/samples", "/streams/state", "/flow/pump"  # paths of the topics
 BY_STREAM = "stream "  # the text of an operator's event that a stream has caused begins so
@@ -76,3 +76,7 @@ class PumpShare(Message):
     slow_share: Annotated[float, "a mean over some seconds, with which routes are planned"]
     observed_share: Annotated[float, "a mean over the time of which an observation of the flow is a mean"]
     sample_ns: Annotated[int, "time that the latest sample tells of, on the session clock"]
+    mark_s: Annotated[
+        Vector, Shape("n"), "times of some ticks of the last seconds and of this one; (0,) without tracers"
+    ] = NOT_STATED
+    flowed_s: Annotated[Vector, Shape("n"), "integral of the share over time up to each of these"] = NOT_STATED

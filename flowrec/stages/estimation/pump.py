@@ -38,6 +38,7 @@ from flowrec.stages.estimation.kalman import memory_s
 _SLOW_S = 5.0  # memory of the mean that plans are made with
 _REYNOLDS = 1.0  # above it a flow is not proportional to the speed at its inlets
 _LEAST = 0.02  # of the share; a flow that nearly stands still says nothing of the flow at the nominal one
+_MARKS = 60  # of the integral of the share that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class PumpFollower:
     delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # time from a change of the flow to the sample that shows it
     smoothing_s: Annotated[float, Range(0.0, 60.0)] = 0.05  # memory of the mean over samples
 
-    def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool, tracers: bool) -> None:
+    def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool) -> None:
         """Raise UsageError where the flow of a chip does not follow its pump by a factor, or no stream measures it."""
         if not self.channel:
             return
@@ -61,8 +62,6 @@ class PumpFollower:
             there = ", ".join(sorted(streams)) or "none"
             raise UsageError(f"{where}: there is no section [streams.{name}]; there are {there}")
         outlets = {opening.value for opening in chip.openings if opening.kind == "outlet"}
-        if tracers:
-            raise UsageError(f"{where}: what tracers tell does not follow the pump; set tracker.tracers = false")
         reason = ""
         if len(outlets) > 1:
             reason = "its outlets have different pressures"
@@ -76,13 +75,21 @@ class PumpFollower:
         if reason:
             raise UsageError(f"{where}: the flow of chip '{chip.name}' is not proportional to its pump's: {reason}")
 
-    def follow(self, last: Tick, tick: Tick) -> PumpShare | None:
-        """The share of this tick; None before the first sample. Of a stream that is silent the last value stays."""
+    def follow(self, last: Tick, tick: Tick, memory_s: float = 0.0) -> PumpShare | None:
+        """The share of this tick; None before the first sample. Of a stream that is silent the last value stays.
+
+        `memory_s`: time over which a mean of the share can be asked for later, see `mean_share`.
+        """
         if not self.channel:
             return None
         known, previous = self._measurement(last, tick), last.extra.get(PUMP)
         if not isinstance(previous, PumpShare):
-            return None if known is None else PumpShare(tick.stamp_ns, *(known[1][-1],) * 3, int(known[0][-1]))
+            if known is None:
+                return None
+            first = PumpShare(tick.stamp_ns, *(known[1][-1],) * 3, int(known[0][-1]))
+            if memory_s <= 0.0:
+                return first
+            return replace(first, mark_s=np.array([seconds(tick.stamp_ns)]), flowed_s=np.zeros(1))
         share, sample_ns = previous.share, previous.sample_ns
         for time_ns, value in zip(*known, strict=True) if known is not None else ():
             share += (value - share) * _weight(seconds(int(time_ns) - sample_ns), self.smoothing_s)
@@ -92,7 +99,20 @@ class PumpFollower:
         # The share is that much behind already.
         filter_s = max(_filter_s(last) - self.delay_s, 0.0)
         observed = previous.observed_share + (share - previous.observed_share) * _weight(dt_s, filter_s)
-        return PumpShare(tick.stamp_ns, float(share), float(slow), float(observed), sample_ns)
+        now = PumpShare(tick.stamp_ns, float(share), float(slow), float(observed), sample_ns)
+        return now if memory_s <= 0.0 else _with_marks(previous, now, memory_s + self.delay_s)
+
+    def mean_share(self, pump: PumpShare, began_s: np.ndarray, ended_s: np.ndarray) -> np.ndarray:
+        """(n,) means of the share over times (n,), (n,); what the sensor will tell within its delay is as it is now.
+
+        A time before the first mark counts as the first.
+        """
+        ends_s = np.stack([began_s, ended_s]) + self.delay_s
+        beyond_s = np.maximum(ends_s - pump.mark_s[-1], 0.0)
+        began, ended = np.interp(ends_s, pump.mark_s, pump.flowed_s) + beyond_s * pump.share
+        known_s = np.maximum(ends_s, pump.mark_s[0])
+        lasted_s = known_s[1] - known_s[0]
+        return np.divide(ended - began, lasted_s, out=np.full(len(began_s), pump.share), where=lasted_s > 0.0)
 
     def _measurement(self, last: Tick, tick: Tick) -> tuple[np.ndarray, np.ndarray] | None:
         """Times and values, over the nominal one, of the samples of this tick; None without any."""
@@ -113,15 +133,36 @@ class PumpFollower:
         share = pump.observed_share
         if share < _LEAST:
             return before
-        newest = now.only(slice(-1, None))
-        error_um_s = self.error_share * float(np.hypot(*newest.flow_um_s[0]))
-        newest = replace(
-            newest,
-            flow_um_s=newest.flow_um_s / share,
-            std_um_s=np.hypot(newest.std_um_s, error_um_s) / share,
-            rolled_um_s=None if newest.rolled_um_s is None else newest.rolled_um_s / share,
-        )
+        newest = self._over(now.only(slice(-1, None)), np.array([share]))
         return newest if len(now.std_um_s) == 1 else now.only(slice(None, -1)).followed_by(newest)
+
+    def stretches_at_nominal(
+        self, pump: PumpShare, new: Observations, began_s: np.ndarray, ended_s: np.ndarray
+    ) -> Observations | None:
+        """Observations that are means over times (n,), (n,), as those of the nominal flow; None if none is left."""
+        share = self.mean_share(pump, began_s, ended_s)
+        flows = share >= _LEAST
+        return self._over(new.only(flows), share[flows]) if flows.any() else None
+
+    def _over(self, observed: Observations, share: np.ndarray) -> Observations:
+        """Observations over the shares (n,) of their times, with the error of the measured ones in theirs."""
+        error_um_s = self.error_share * np.hypot(*observed.flow_um_s.T)
+        return replace(
+            observed,
+            flow_um_s=observed.flow_um_s / share[:, None],
+            std_um_s=np.hypot(observed.std_um_s, error_um_s) / share,
+            rolled_um_s=None if observed.rolled_um_s is None else observed.rolled_um_s / share[:, None],
+        )
+
+
+def _with_marks(previous: PumpShare, now: PumpShare, memory_s: float) -> PumpShare:
+    """The share with the integral over time up to now; marks lie a part of the memory apart, the last one is now."""
+    time_s, marks, flowed = seconds(now.stamp_ns), previous.mark_s, previous.flowed_s
+    total = flowed[-1] + 0.5 * (previous.share + now.share) * (time_s - marks[-1])
+    if len(marks) > 1 and marks[-1] - marks[-2] < memory_s / _MARKS:
+        marks, flowed = marks[:-1], flowed[:-1]
+    kept = slice(-_MARKS - 2, None)  # two more: the time of an image, and the mark that the memory ends in
+    return replace(now, mark_s=np.append(marks[kept], time_s), flowed_s=np.append(flowed[kept], total))
 
 
 def _weight(dt_s: float, memory: float) -> float:

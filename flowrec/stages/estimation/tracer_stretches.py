@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from flowrec.core import Observations, Tracers
+from flowrec.core import Floats, Observations, Tracers
+
+AtNominal = Callable[[Observations, Floats, Floats], Observations | None]
 
 CAPACITY = 2000  # the oldest are dropped first
 _LEAST_MOVED = 5.0  # standard deviations of the distance: what has not moved so far is stuck
@@ -13,13 +17,17 @@ _FLOOR_UM_S = 2.0  # least sigma of an observation
 
 
 def collect_stretches(
-    previous: Observations | None, before: Tracers | None, tracers: Tracers | None
+    previous: Observations | None,
+    before: Tracers | None,
+    tracers: Tracers | None,
+    at_nominal: AtNominal | None = None,
 ) -> Observations | None:
     """The observations after this frame; the previous object itself when no stretch has ended.
 
     A stretch has ended for each tracer of `tracers` that begins another one, see `Tracers.from_um`. The place is the
     middle of its ends, the standard deviation that of their difference. One that has not moved tells no flow: it sticks
-    to the floor.
+    to the floor. `at_nominal` makes observations, of the times at which they began and ended, those of the flow of the
+    map.
     """
     if before is None or tracers is None or tracers is before or not before.count:
         return previous
@@ -47,4 +55,7 @@ def collect_stretches(
         tracers.id[known][over],
         tracers.entered[known][over],
     )
-    return new if previous is None else previous.followed_by(new).only(slice(-CAPACITY, None))
+    told = new if at_nominal is None else at_nominal(new, began_s[over], ended_s[over])
+    if told is None or previous is None:
+        return previous if told is None else told
+    return previous.followed_by(told).only(slice(-CAPACITY, None))

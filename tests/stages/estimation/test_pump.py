@@ -30,7 +30,7 @@ def channel(*values: float) -> Chip:
     return Chip("channel", mask, 10.0, (Opening("left", 6, 13, "inlet", 200.0), *outlets), 1.0, 1000.0)
 
 
-def flown(pump: PumpFollower, measured: list[float]) -> list[PumpShare | None]:
+def flown(pump: PumpFollower, measured: list[float], memory_s: float = 0.0) -> list[PumpShare | None]:
     """The share at each tick, with one sample a tick, taken at the tick."""
     states = StreamStates(
         0,
@@ -48,7 +48,7 @@ def flown(pump: PumpFollower, measured: list[float]) -> list[PumpShare | None]:
             place, times = np.array([0, 1], np.int32), np.array([stamp, stamp])
             new[SAMPLES] = Samples(stamp, place, times, np.array([99.0, value]), np.array([99.0, value]))
         tick = Tick(stamp, extra=last.extra.with_messages(new))  # type: ignore[arg-type]
-        share = pump.follow(last, tick)
+        share = pump.follow(last, tick, memory_s)
         shares.append(share)
         last = tick if share is None else replace(tick, extra=tick.extra.with_messages({PUMP: share}))
     return shares
@@ -99,6 +99,26 @@ def test_an_observation_is_that_of_the_nominal_flow_with_the_error_of_the_pump_i
     assert PumpFollower("pump/flow").at_nominal(first, both, still) is first
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.3])
+def test_what_a_bead_tells_is_over_the_mean_share_of_its_own_stretch_of_time(delay_s: float) -> None:
+    def flow(time_s: np.ndarray) -> np.ndarray:
+        return 1.0 + 0.5 * np.sin(2.0 * np.pi * 0.7 * time_s)
+
+    ticks_s = STEP_S * np.arange(200)
+    pump = PumpFollower("pump/flow", smoothing_s=0.0, error_share=0.1, delay_s=delay_s)
+    share = flown(pump, flow(ticks_s - delay_s).tolist(), memory_s=4.0)[-1]
+    assert share is not None and len(share.mark_s) < 70  # bounded, however long the run is
+    began_s, ended_s = np.array([4.1, 6.0]), np.array([7.0, 6.5])
+    means = np.array([flow(np.linspace(a, b, 1000)).mean() for a, b in zip(began_s, ended_s, strict=True)])
+    assert pump.mean_share(share, began_s, ended_s) == pytest.approx(means, rel=0.02)
+    seen = Observations(1, np.zeros((2, 2)), means[:, None] * np.array([200.0, 0.0]), np.full(2, 5.0), None)
+    nominal = pump.stretches_at_nominal(share, seen, began_s, ended_s)
+    assert nominal is not None and nominal.flow_um_s[:, 0] == pytest.approx(200.0, rel=0.02)
+    assert nominal.std_um_s == pytest.approx(np.hypot(5.0, 20.0 * means) / means, rel=0.02)
+    stands = replace(share, flowed_s=np.zeros_like(share.flowed_s), share=0.0)
+    assert pump.stretches_at_nominal(stands, seen, began_s, ended_s) is None
+
+
 def test_routes_are_planned_with_the_slow_mean_of_the_pump() -> None:
     flow = FlowSolver(convection=False).solve(channel())
     tick = Tick(1, assumed=flow)
@@ -122,8 +142,6 @@ def test_a_flow_that_does_not_follow_its_pump_by_a_factor_is_refused(
 ) -> None:
     pump = PumpFollower("pump/flow")
     with pytest.raises(UsageError, match=complaint):
-        pump.refuse_unfit(chip, streams, inertia=True, tracers=False)
-    pump.refuse_unfit(channel(), ("pump",), inertia=True, tracers=False)
-    with pytest.raises(UsageError, match="what tracers tell does not follow the pump"):
-        pump.refuse_unfit(channel(), ("pump",), inertia=True, tracers=True)
-    PumpFollower().refuse_unfit(chip, (), inertia=True, tracers=True)
+        pump.refuse_unfit(chip, streams, inertia=True)
+    pump.refuse_unfit(channel(), ("pump",), inertia=True)
+    PumpFollower().refuse_unfit(chip, (), inertia=True)
