@@ -23,7 +23,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from flowrec.console.access import Access
 from flowrec.console.board import MOST_PAGES, NOTHING, Board
 from flowrec.console.rerun_viewer import RerunViewer
-from flowrec.run import COMMANDS, GOAL, HAND, LONGEST_NOTE, NOTE, SPEED
+from flowrec.run import COMMANDS, GOAL, HAND, LONGEST_NOTE, NOTE, OUTPUT, SPEED
 
 _PERIOD_S = 0.1  # from one state to the next of a page
 _FROZEN_S = 30.0  # a page that takes nothing for so long is let go
@@ -188,6 +188,8 @@ class _Commands:
         if name == SPEED:
             limit = asked["limit_um_s"]
             return {"command": name, "limit_um_s": None if limit is None else _finite(limit)[0]}
+        if name == OUTPUT:
+            return {"command": name, "name": str(asked["name"]), "value": _finite(asked["value"])[0]}
         text = str(asked.get("text", ""))[:LONGEST_NOTE]
         if name == NOTE and not text.strip():
             raise ValueError("a note without a text")

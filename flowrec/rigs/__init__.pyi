@@ -16,7 +16,7 @@ from .rig import (
 )
 from .streams.log import LogStream as LogStream, RunLog as RunLog
 from .streams.stream import (
-    Chunk as Chunk, NoStreamError as NoStreamError, SampleStream as SampleStream, StreamHead as StreamHead,
+    Chunk as Chunk, NoStreamError as NoStreamError, SampleStream as SampleStream, SettableStream as SettableStream, StreamHead as StreamHead,
     settings_of_device as settings_of_device,
 )
 from .simulated.rig import SimulatedRig as SimulatedRig, true_view as true_view

@@ -4,7 +4,7 @@ from .control import RunControl as RunControl
 from .disk_monitor import DiskMonitor as DiskMonitor, refuse_below as refuse_below
 from .loop import Joining as Joining, RunReport as RunReport, Sink as Sink, run as run
 from .operator_commands import (
-    COMMANDS as COMMANDS, GOAL as GOAL, HAND as HAND, HELP as HELP, LONGEST_NOTE as LONGEST_NOTE, NOTE as NOTE, SPEED as SPEED,
+    COMMANDS as COMMANDS, GOAL as GOAL, HAND as HAND, HELP as HELP, LONGEST_NOTE as LONGEST_NOTE, NOTE as NOTE, OUTPUT as OUTPUT, SPEED as SPEED,
     obey as obey,
 )
 from .recorded import RecordedRig as RecordedRig

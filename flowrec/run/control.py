@@ -75,6 +75,7 @@ class RunControl:
         self._steered_ns = -_STEERING_NS
         self._held_by_stream = False  # and by no person
         self.hand = HandSteering(clock)
+        self.outputs: dict[str, Callable[[float], None]] = {}  # beside the coils, by stream/channel; each sets it
         self._zero_sent = self._at_work = self._looping = False
         self._working = False  # in `unless_stopped`, also on the way out of it
         self._raised_s = math.inf  # time of the last `Interrupted`
@@ -114,6 +115,18 @@ class RunControl:
             raise UsageError(f"speed limit {speed_um_s:g} um/s: it is {least:g} to {most:g} um/s, or none")
         text, limit_um_s = ("no limit", None) if speed_um_s is None else (f"{speed_um_s:g} um/s", float(speed_um_s))
         self._steering[Action.SPEED].append(OperatorEvent(0, Action.SPEED, text, speed_limit_um_s=limit_um_s))
+
+    def set_output(self, name: str, value: float) -> None:
+        """Set an output beside the coils, such as a lamp; its stream records the value, and a note says so.
+
+        Raises
+        ------
+        UsageError : the run has no such output, or it must not have this value.
+        """
+        if name not in self.outputs:
+            raise UsageError(f"{name!r} is no output of this run; its outputs are {', '.join(self.outputs) or 'none'}")
+        self.outputs[name](value)
+        self.request(Action.NOTE, f"{name} set to {value:g}")
 
     def mark(self) -> bool:
         """Ask for the next numbered mark; keys and console share the numbers. False as of `request`."""

@@ -14,7 +14,7 @@ from flowrec.run.control import LONGEST_TEXT, RunControl
 
 LONGEST_NOTE = LONGEST_TEXT
 NOTE = "note"  # the command with a text
-GOAL, SPEED, HAND = "goal", "speed", "hand"  # commands with numbers
+GOAL, SPEED, HAND, OUTPUT = "goal", "speed", "hand", "output"  # commands with numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,18 +92,20 @@ def obey(control: RunControl, words: dict[str, Any]) -> str:
 
     Parameters
     ----------
-    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), of a hand what
-        `_steer` takes, else `text`.
+    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), `name` and `value` of
+        an output, of a hand what `_steer` takes, else `text`.
     """
     try:
         name = words["command"]
-        if name in (GOAL, SPEED, HAND) and control.reason:
+        if name in (GOAL, SPEED, HAND, OUTPUT) and control.reason:
             return f"the run ends: {control.reason}"
         taken: bool | None = True
         if name == GOAL:
             control.set_goal(float(words["x_um"]), float(words["y_um"]))
         elif name == HAND:
             return _steer(control, words)
+        elif name == OUTPUT:
+            control.set_output(str(words["name"]), float(words["value"]))
         elif name == SPEED:
             limit = words["limit_um_s"]
             control.limit_speed(None if limit is None else float(limit))

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -30,7 +31,16 @@ from flowrec.core import (
     UsageError,
     seconds,
 )
-from flowrec.rigs import Clocked, LogStream, Measuring, Rig, RunLog, SampleStream, settings_of_device
+from flowrec.rigs import (
+    Clocked,
+    LogStream,
+    Measuring,
+    Rig,
+    RunLog,
+    SampleStream,
+    SettableStream,
+    settings_of_device,
+)
 from flowrec.run.control import RunControl
 from flowrec.run.stream_reader import StreamReader
 from flowrec.stages import STREAM_KINDS, Inputs, StreamSettings
@@ -86,6 +96,10 @@ class StreamInputs:
             _Known(StreamReader(name, stream, settings[name], tell), [], _needs_rig(settings[name]))
             for name, stream in streams.items()
         ]
+        for name, stream in streams.items():
+            if isinstance(stream, SettableStream):
+                for place, channel in enumerate(settings[name].channels):
+                    control.outputs[f"{name}/{channel}"] = partial(stream.set, place)
         self._log = log
         self._logged: dict[str, LogStream] = {
             name: stream for name, stream in streams.items() if isinstance(stream, LogStream)
@@ -119,7 +133,7 @@ class StreamInputs:
                         f"{setting} = {channel!r}: stream {name} has no such channel, but {', '.join(there)}"
                     )
         if self._log is not None:
-            self._log.attach(self._logged)
+            self._log.attach(self._logged, self._control.set_output)
             stack.callback(self._log.attach, {})
 
     def __enter__(self) -> Self:
@@ -249,11 +263,11 @@ def stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool) 
             f"streams.{name}.kind = {settings.kind!r}: samples of other programs come in real time; record with "
             "--realtime or the rig lab, or leave the section out"
         )
-    row = STREAM_KINDS[settings.kind]
-    if row.source is not None:
-        device = settings_of_device(row.settings, settings.device, f"streams.{name}.device")
-        settings = replace(settings, device=device)
+    kind = STREAM_KINDS[settings.kind].load()
+    own: Any = getattr(kind, "Settings", None)
+    if own is not None:
+        settings = replace(settings, device=settings_of_device(own, settings.device, f"streams.{name}.device"))
     elif settings.device:
         raise UsageError(f"streams.{name}.device: the kind {settings.kind!r} has no settings of its own; leave it out")
-    stream: SampleStream = row.load().of(name, settings)
+    stream: SampleStream = kind.of(name, settings)
     return stream

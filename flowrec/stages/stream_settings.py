@@ -12,6 +12,12 @@ SIMULATED_STREAM, LOG = "simulated", "log"
 STREAM_KINDS = Methods(
     "streams.NAME.kind",
     Method("lsl", "flowrec.rigs.streams.lsl:LslStream", "an outlet of the Lab Streaming Layer", extra="streams"),
+    Method(
+        "serial",
+        "flowrec.rigs.streams.serial_output:SerialOutput",
+        "a lamp, a valve or a generator on a serial port, which is set and recorded",
+        extra="serial",
+    ),
     Method(LOG, "flowrec.rigs.streams.log:LogStream", "what a program of Python gives to flowrec.RunLog.log"),
     Method(
         SIMULATED_STREAM,
@@ -47,4 +53,5 @@ class StreamSettings:
     wait_s: Annotated[float, Range(0.1, 600.0)] = 5.0
     # largest number of samples that may wait for the loop; beyond it the oldest are lost
     queue_samples: Annotated[int, Range(1, 10_000_000)] = 100_000
-    device: dict[str, Any] = field(default_factory=dict)  # settings of a kind of another package
+    # settings of a kind that has its own: `serial` (rigs/streams/serial_output.py), and those of other packages
+    device: dict[str, Any] = field(default_factory=dict)

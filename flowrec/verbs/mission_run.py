@@ -258,7 +258,12 @@ class _Mission:
             view,
             (self._config, self._chip, self._output.path),
             partial(obey, self.run_control) if console else None,
-            lambda: {"disk": disk.text, "file_mb": writer.bytes_written / 1e6, "duration_s": duration_s},
+            lambda: {
+                "disk": disk.text,
+                "file_mb": writer.bytes_written / 1e6,
+                "duration_s": duration_s,
+                "outputs": list(self.run_control.outputs),
+            },
         )
 
     def fly(self, displays: Sequence[Sink]) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
 import sys
+import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -62,13 +64,25 @@ def recorded(out: Path, *sets: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    with recorded(tmp_path / "a.mcap", *LONG, *CAMERA) as process:
+def lamp() -> Iterator[tuple[int, str]]:
+    """A pseudo terminal in the place of a lamp's serial port: the end of the lamp, and the name of the port."""
+    lamp, port = os.openpty()
+    tty.setraw(port)
+    yield lamp, os.ttyname(port)
+    os.close(lamp)
+    os.close(port)
+
+
+@pytest.fixture
+def run(tmp_path: Path, lamp: tuple[int, str]) -> Iterator[subprocess.Popen[str]]:
+    device = f'{{port = "{lamp[1]}", lines = ["L {{:.1f}}"], values = [0.2], rest = [0.0], most = [1.0]}}'
+    light = ["streams.lamp.kind=serial", 'streams.lamp.channels=["light"]', f"streams.lamp.device={device}"]
+    with recorded(tmp_path / "a.mcap", *LONG, *CAMERA, *light) as process:
         yield process
 
 
 def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
-    run: subprocess.Popen[str], tmp_path: Path, browser: Any
+    run: subprocess.Popen[str], tmp_path: Path, browser: Any, lamp: tuple[int, str]
 ) -> None:
     out = tmp_path / "a.mcap"
     assert run.stdout is not None
@@ -134,8 +148,12 @@ def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
     page.keyboard.press("Enter")
     event("note: m q ! look").wait_for()
     page.get_by_role("spinbutton", name="Speed limit").fill("90")
-    page.get_by_role("button", name="Set", exact=True).click()
+    page.locator("#speed").get_by_role("button", name="Set", exact=True).click()
     page.locator("#limit", has_text="90 µm/s").wait_for()
+    page.get_by_role("combobox", name="Name of the output").select_option("lamp/light")
+    page.get_by_role("spinbutton", name="Output").fill("0.7")
+    page.locator("#output").get_by_role("button", name="Set", exact=True).click()
+    event("note: lamp/light set to 0.7").wait_for()
     asked_for = load_config(None, [*LONG, *CAMERA])
     chip = load_chip(asked_for.chip)
     column, row = calibration_of(resolve(asked_for, chip), chip).to_px(GOAL_UM) + 0.5
@@ -161,8 +179,14 @@ def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
         if tick.operator.action == "zero":  # on that very tick
             assert before.currents.amplitude_mt > 0.0  # type: ignore[union-attr]
             assert tick.currents.amplitude_mt == 0.0  # type: ignore[union-attr]
-    assert [each.action for each in asked] == ["mark", "mark", "pause", "resume", "note", "speed", "goal", "zero"]
-    speed, goal, stop = asked[-3:]
+    assert [each.action for each in asked] == [
+        *("mark", "mark", "pause", "resume", "note", "speed", "note", "goal", "zero")
+    ]
+    speed, _, goal, stop = asked[-4:]
+    assert os.read(lamp[0], 100).split(b"\n")[:-1] == [b"L 0.2", b"L 0.7", b"L 0.0"]
+    with Session(out) as session:
+        light = session.stream("lamp/light").value
+    assert light[0] == 0.2 and light[-1] == 0.7 and set(light.tolist()) == {0.2, 0.7}
     assert (speed.speed_limit_um_s, stop.text) == (90.0, "operator: zero field (console)")
     np.testing.assert_allclose(goal.goal_um, GOAL_UM, atol=Session(out).calibration.um_per_px)
     done = again.replay_session(out, again.Change(), verify=True)

@@ -78,7 +78,7 @@ for (const row of facts.commands) {
 
 document.addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-  if (event.target instanceof HTMLInputElement) {
+  if (event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) {
     if (event.key === "Escape") dropNote();
     return;
   }
@@ -106,6 +106,11 @@ part("speed").addEventListener("submit", (event) => {
   event.preventDefault();
   command("speed", { limit_um_s: Number(part("speed-value").value) });
   part("speed-value").blur();
+});
+part("output").addEventListener("submit", (event) => {
+  event.preventDefault();
+  command("output", { name: part("output-name").value, value: Number(part("output-value").value) });
+  part("output-value").blur();
 });
 part("speed-none").addEventListener("click", () => command("speed", { limit_um_s: null }));
 
@@ -185,6 +190,11 @@ function showState(state) {
   part("time").textContent = `${state.time_s.toFixed(1)}${limit} s`;
   part("field").textContent = state.field;
   part("error").textContent = state.error_um === null ? "-" : `${state.error_um} µm`;
+  const outputs = state.outputs ?? [];
+  if (part("output-name").length !== outputs.length) {
+    part("output-name").replaceChildren(...outputs.map((name) => new Option(name)));
+    part("output").hidden = outputs.length === 0;
+  }
   part("limit").textContent = state.speed_limit_um_s !== null ? `${state.speed_limit_um_s} µm/s` : "none";
   part("losses").textContent = state.losses.length ? state.losses.join(", ") : "none";
   part("losses").classList.toggle("bad", state.losses.length > 0);

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -31,6 +32,7 @@ class RunLog:
         self._streams: dict[str, LogStream] = {}
         self._early: deque[tuple[str, int, float, str]] = deque(maxlen=1000)  # before the run has taken it
         self._lock = threading.Lock()
+        self._set: Callable[[str, float], None] | None = None
 
     def log(self, name: str, stamp_ns: int, value: float, unit: str = "") -> None:
         """Give one value; it never waits.
@@ -57,10 +59,21 @@ class RunLog:
             stream = stream if stream is not None else self._streams[LOG]
             stream.add(channel, int(stamp_ns), float(value), unit)
 
-    def attach(self, streams: dict[str, LogStream]) -> None:
-        """Give the values to these streams, by name, from now on; the run calls it."""
+    def set(self, name: str, value: float) -> None:
+        """Set an output of the run beside the coils, such as `lamp/light` of [streams.lamp]; it never waits.
+
+        Raises
+        ------
+        UsageError : no run has it now, or it must not have this value.
+        """
+        if self._set is None:
+            raise UsageError(f"set {name!r}: no run is under way that takes it")
+        self._set(name, float(value))
+
+    def attach(self, streams: dict[str, LogStream], setting: Callable[[str, float], None] | None = None) -> None:
+        """Give the values to these streams, by name, and what is set to `setting`, from now on; the run calls it."""
         with self._lock:
-            self._streams = streams
+            self._streams, self._set = streams, setting
             early = list(self._early)
             self._early.clear()
         for each in early if streams else ():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +95,19 @@ class SampleStream(Protocol):
 
     def close(self) -> None:
         """Disconnect; never raises."""
+
+
+@runtime_checkable
+class SettableStream(Protocol):
+    """A stream of what an operator or a program can set: a lamp, a generator. Its samples are the values as set."""
+
+    def set(self, place: int, value: float) -> None:
+        """Set a channel, by its place in the head, soon; called in any thread, it never waits.
+
+        Raises
+        ------
+        UsageError : a value that the channel must not have; one line.
+        """
 
 
 def named_channels(settings: StreamSettings, stated: list[str], count: int) -> tuple[str, ...]:

@@ -1,0 +1,196 @@
+"""Outputs beside the coils on a pseudo terminal: set before the run, by a person, after it; read back, and refused."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowrec.core.errors import UsageError
+from flowrec.core.messages import SAMPLES, SILENT, STREAMS, Applied
+from flowrec.rigs.streams.log import RunLog
+from flowrec.run.control import RunControl
+from flowrec.run.operator_commands import obey
+from flowrec.run.stream_inputs import StreamInputs
+from flowrec.stages.config import load_config
+from flowrec.stages.inputs import Inputs
+
+pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")
+tty = pytest.importorskip("tty", reason="no pseudo terminals on this system")
+
+GENERATOR = {
+    "lines": ["VOLT {:.2f}", "FREQ {:.0f}"],
+    "values": [2.0, 1e6],
+    "rest": [0.0, 1e6],
+    "least": [0.0, 1e3],
+    "most": [5.0, 3e6],
+    "period_s": 0.05,
+}
+
+
+class Device:
+    """A function generator: keeps what it is set to, and answers when it is asked; its amplitude stops at 3 V."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self.lines: list[str] = []
+        self.state = {"VOLT": 0.0, "FREQ": 0.0}
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        taken = b""
+        while not self._closing.is_set():
+            if not select.select([self._master], [], [], 0.01)[0]:
+                continue
+            taken += os.read(self._master, 100)
+            *lines, taken = taken.split(b"\n")
+            for line in map(bytes.decode, lines):
+                self.lines.append(line)
+                if line.endswith("?"):
+                    os.write(self._master, b"%s %.3e V\r\n" % (line[:-1].encode(), self.state[line[:-1]]))
+                else:
+                    name, value = line.split()
+                    self.state[name] = min(float(value), 3.0 if name == "VOLT" else 1e9)
+
+    def unplug(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        os.close(self._master)
+        os.close(self._slave)
+
+
+@dataclass
+class Clock:
+    """A rig whose stamp 0 is now."""
+
+    epoch_ns: int | None
+
+
+def ticks(clock: Clock) -> Iterator[Inputs]:
+    while True:
+        time.sleep(0.02)
+        stamp = time.monotonic_ns() - (clock.epoch_ns or 0)
+        yield Inputs(stamp, None, Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2)))
+
+
+def streams_of(control: RunControl, told: list[str], **device: Any) -> tuple[StreamInputs, Clock, RunLog]:
+    clock, log = Clock(time.monotonic_ns()), RunLog()
+    sets = {
+        "kind": "serial",
+        "channels": ["volt", "hertz"],
+        "on_silence": "stop",
+        "device": {**GENERATOR, **device},
+    }
+    config = load_config(None, {f"streams.generator.{name}": value for name, value in sets.items()})
+    return StreamInputs(config.streams, clock, control, told.append, log, realtime=True), clock, log  # type: ignore[arg-type]
+
+
+def flown(device: Device, act: Callable[[RunControl, RunLog], None], **settings: Any) -> tuple[np.ndarray, RunControl]:
+    """The values of both channels, (n, 2), of half a second before and after something is done."""
+    control, told, found = RunControl(), list[str](), list[np.ndarray]()
+    streams, clock, log = streams_of(control, told, port=device.port, **settings)
+    with ExitStack() as stack:
+        streams.connect(stack)
+        assert device_has(device, "VOLT 2.00", "FREQ 1000000"), device.lines  # before the run
+        stack.enter_context(streams)
+        for number, joined in enumerate(streams.join(ticks(clock))):
+            if SAMPLES in joined.extra:
+                found.append(joined.extra[SAMPLES].value.reshape(-1, 2))  # type: ignore[attr-defined]
+            if number == 25:
+                act(control, log)
+            if number == 60:
+                break
+    assert not told
+    return np.concatenate(found), control
+
+
+def device_has(device: Device, *lines: str) -> bool:
+    end_s = time.monotonic() + 5.0
+    while not set(lines) <= set(device.lines) and time.monotonic() < end_s:
+        time.sleep(0.01)
+    return set(lines) <= set(device.lines)
+
+
+def test_an_output_is_set_before_the_run_by_console_and_program_in_it_and_to_rest_after_it() -> None:
+    device = Device()
+
+    def act(control: RunControl, log: RunLog) -> None:
+        assert obey(control, {"command": "output", "name": "generator/volt", "value": 4.5}) == ""
+        log.set("generator/hertz", 2e6)
+
+    values, control = flown(device, act)
+    assert values[0].tolist() == [2.0, 1e6] and values[-1].tolist() == [4.5, 2e6]
+    assert device_has(device, "VOLT 4.50", "FREQ 2000000", "VOLT 0.00")
+    assert device.lines[-2:] == ["VOLT 0.00", "FREQ 1000000"]  # however the run ends
+    noted = [control.next_event(1, held=False), control.next_event(2, held=False)]
+    assert [each.text for each in noted if each] == ["generator/volt set to 4.5", "generator/hertz set to 2e+06"]
+
+
+def test_where_the_device_is_asked_its_answer_is_recorded_and_not_the_wish() -> None:
+    device = Device()
+    values, _ = flown(device, lambda control, _: control.set_output("generator/volt", 4.5), ask=["VOLT?", "FREQ?"])
+    assert values[0].tolist() == [2.0, 1e6] and values[-1].tolist() == [3.0, 1e6]  # 3 V is all that it gives
+
+
+def test_a_value_beyond_its_limits_an_unknown_output_and_one_without_a_run_are_refused() -> None:
+    control, told = RunControl(), list[str]()
+    _, _, log = streams_of(control, told)
+    refused = {
+        ("generator/volt", 5.1): "generator/volt = 5.1: must be from 0 to 5",
+        ("generator/volt", float("nan")): "generator/volt = nan: must be from 0 to 5",
+        ("lamp/light", 1.0): "'lamp/light' is no output of this run; its outputs are generator/volt, generator/hertz",
+    }
+    for (name, value), complaint in refused.items():
+        assert obey(control, {"command": "output", "name": name, "value": value}) == complaint
+    with pytest.raises(UsageError, match="no run is under way that takes it"):
+        log.set("generator/volt", 1.0)
+    assert control.next_event(1, held=False) is None  # nothing is noted of what was not done
+
+
+def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_says_so() -> None:
+    device, control, told, states = Device(), RunControl(), list[str](), list[Any]()
+    streams, clock, _ = streams_of(control, told, port=device.port)
+    with ExitStack() as stack:
+        streams.connect(stack)
+        stack.enter_context(streams)
+        for number, joined in enumerate(streams.join(ticks(clock))):
+            states += [joined.extra[STREAMS]] if STREAMS in joined.extra else []
+            if number == 10:
+                device.unplug()
+            if (states and states[-1].state[0] == SILENT) or number > 500:
+                break
+    assert states[-1].state[0] == SILENT and control.reason == "stream generator is silent"
+    assert any("the device on" in line and "does not answer" in line for line in told), told
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"lines": ["VOLT {:.2f}"]}, r"streams\.generator\.device\.lines has 1 elements, where there are 2 channels"),
+        ({"rest": [0.0]}, r"device\.rest has 1 elements"),
+        ({"lines": ["VOLT 2", "FREQ {}"]}, r"'VOLT 2' for volt has no place for the value, such as \{:\.3f\}"),
+        ({"lines": ["VOLT {:d}", "FREQ {}"]}, r"device\.lines: 'VOLT \{:d\}' for volt: Unknown format code"),
+        ({"values": [9.0, 1e6]}, r"streams\.generator\.device: volt = 9: must be from 0 to 5"),
+        ({"rest": [-1.0, 1e6]}, r"volt = -1: must be from 0 to 5"),
+        ({"volts": 1}, r"streams\.generator\.device: unknown key volts"),
+        ({"baud": 1}, r"streams\.generator\.device\.baud = 1: must be from 300"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_in_one_line_before_the_port_is_opened(
+    changes: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(UsageError, match=complaint) as caught:
+        streams_of(RunControl(), [], **changes)
+    assert "\n" not in str(caught.value)
