@@ -115,7 +115,7 @@ class StreamInputs:
 
         Parameters
         ----------
-        read : channels that a stage reads, STREAM/CHANNEL, by the setting that names them.
+        read : the setting that names each channel that a stage reads, by its STREAM/CHANNEL.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class StreamInputs:
             stack.callback(each.reader.close)
             each.reader.connect()
             there = each.reader.head.channels
-            for setting, channel in read.items():
+            for channel, setting in read.items():
                 name, _, wanted = channel.partition("/")
                 if name == each.reader.name and there and wanted not in there:
                     raise UsageError(

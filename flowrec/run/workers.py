@@ -73,7 +73,7 @@ def _compute(pipeline: Pipeline, order: Tick, mission: Mission) -> Result:
         return replace(solved, error_share=pipeline.refiner.prior_error_share(pipeline.chip, pipeline.solver))
     if mission.wanted == WorkOrder.REFINE:
         return _refine(pipeline, order, mission)
-    order = as_planned(order)
+    order = as_planned(order, pipeline.inlets)
     if mission.wanted == WorkOrder.SURVEY_ROUTE:
         return survey_route(pipeline, order, mission)
     return route(pipeline, order, mission)

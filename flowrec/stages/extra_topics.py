@@ -59,7 +59,7 @@ def extra_rows(config: Any) -> Iterator[ExtraRow]:
 
 def topics_of(config: Any) -> TopicTable:
     """The topics of a run; UsageError if two of one path are named."""
-    pump = [PUMP_TOPIC] if config.pump.channel else []
+    pump = [PUMP_TOPIC] if config.pump.channels else []
     ours = [*(STREAM_TOPICS if config.streams else ()), *pump, *robot_topics(config)]
     if not config.topics and not ours:
         return FIXED

@@ -48,6 +48,7 @@ from flowrec.stages.control.events import event_of
 from flowrec.stages.control.mission import MissionStateMachine
 from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
 from flowrec.stages.estimation.pump import PumpFollower, at_pump
+from flowrec.stages.estimation.superposition import Superposition
 from flowrec.stages.estimation.tracer_stretches import collect_stretches
 from flowrec.stages.extra_topics import ExtraStage, extra_rows, topics_of
 from flowrec.stages.inputs import FROM_IMAGE, Inputs, with_inputs
@@ -82,6 +83,7 @@ class Pipeline:
     health: HealthMonitor
     sampler: Sampler
     pump: PumpFollower
+    inlets: Superposition | None  # of several pumps
     others: OtherRobots
     mission: MissionStateMachine
     controller: Controller
@@ -100,7 +102,7 @@ class Pipeline:
 def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     """The stages of a resolved configuration on its chip."""
     config.tracker.refuse_unfit()
-    config.pump.refuse_unfit(chip, config.streams, inertia=config.flow.convection)
+    config.pump.refuse_unfit(chip, config.streams, inertia=config.flow.convection, tracers=config.tracker.tracers)
     return Pipeline(
         chip=chip,
         calibration=calibration_of(config, chip),
@@ -115,6 +117,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
         health=config.health,
         sampler=config.sampler,
         pump=config.pump,
+        inlets=Superposition.of(chip, config.flow) if config.pump.inlets else None,
         others=config.others,
         mission=config.mission,
         controller=config.control,
@@ -287,8 +290,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     """
     p = pipeline
     tick = with_inputs(last, inputs, p.topics)
-    pump = p.pump.follow(last, tick, p.tracker.tracer.stretch_s if p.tracker.tracers else 0.0)
-    flow, route = at_pump(tick.field, pump), tick.route
+    pump = p.pump.follow(last, tick, p.inlets, p.tracker.tracer.stretch_s if p.tracker.tracers else 0.0)
+    flow, route = at_pump(tick.field, pump, p.inlets), tick.route
     sight = _find_robot(p, last, inputs)
     track, appearance = sight.track, sight.appearance
     assert track is not None, "the tracker says of every image whether it shows the robot"
@@ -323,7 +326,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     before = None if last.estimate is None else p.observer.measured_estimate(last.mapless, last.estimate)
     observations = p.sampler.collect(last.observations, before, measured, p.robot)
     if pump is not None:
-        observations = p.pump.at_nominal(last.observations, observations, pump)
+        observations = p.pump.at_nominal(last.observations, observations, pump, p.inlets)
         tick = replace(tick, extra=tick.extra.with_messages({PUMP: pump}))
     walls = None
     if sight.others:

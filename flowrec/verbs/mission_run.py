@@ -199,8 +199,8 @@ class _Mission:
         if isinstance(rig, Connecting):
             stack.enter_context(rig.connected())
         if self._streams is not None:
-            pump = config.pump.channel
-            self._streams.connect(stack, {"pump.channel": pump} if pump else {})
+            setting = "pump.inlets" if config.pump.inlets else "pump.channel"
+            self._streams.connect(stack, dict.fromkeys(config.pump.channels, setting))
         if isinstance(rig, Picturing) and config.mission.check_axes:
             verdict = checked_image(rig.picture(), config, chip, "camera")
             self._source |= {"source_axes": verdict.text} if verdict is not None else {}

@@ -80,3 +80,9 @@ class PumpShare(Message):
         Vector, Shape("n"), "times of some ticks of the last seconds and of this one; (0,) without tracers"
     ] = NOT_STATED
     flowed_s: Annotated[Vector, Shape("n"), "integral of the share over time up to each of these"] = NOT_STATED
+    inlets: Annotated[
+        Vector,
+        Shape("m"),
+        "Of several pumps, four numbers an inlet: share, slow share, observed share, and the time in s that its latest "
+        "sample tells of; the shares above are means by the inflow of each. (0,) of one pump.",
+    ] = NOT_STATED

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -22,6 +22,7 @@ from flowrec.core import (
     SAMPLES,
     STREAMS,
     Estimate,
+    Floats,
     FlowField,
     Observations,
     PumpShare,
@@ -30,10 +31,12 @@ from flowrec.core import (
     StreamStates,
     Tick,
     UsageError,
+    nanoseconds,
     seconds,
 )
 from flowrec.physics import Chip
 from flowrec.stages.estimation.kalman import memory_s
+from flowrec.stages.estimation.superposition import Superposition
 
 _SLOW_S = 5.0  # memory of the mean that plans are made with
 _REYNOLDS = 1.0  # above it a flow is not proportional to the speed at its inlets
@@ -43,24 +46,28 @@ _MARKS = 60  # of the integral of the share that are kept
 
 @dataclass(frozen=True, slots=True)
 class PumpFollower:
-    """A measured flow rate or pressure of the pump that feeds all inlets; the flow of the map follows it."""
+    """A measured flow rate or pressure of the pump that feeds all inlets, or of one at each; the map's flow follows."""
 
     channel: str = ""  # stream and channel that measure it, such as pump/flow; '': nothing does
     # value of the channel, in its unit, at which the inlets have the speeds that the chip states
     nominal: Annotated[float, Range(1e-12, 1e12)] = 1.0
+    inlets: tuple[str, ...] = ()  # of several pumps: the channel of each inlet, in the order of the chip's openings
+    nominals: tuple[float, ...] = ()  # values of these channels at the speeds that the chip states; []: nominal for all
     error_share: Annotated[float, Range(0.0, 1.0)] = 0.02  # standard deviation of the measured value, as a ratio
     delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # time from a change of the flow to the sample that shows it
     smoothing_s: Annotated[float, Range(0.0, 60.0)] = 0.05  # memory of the mean over samples
 
-    def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool) -> None:
+    def refuse_unfit(self, chip: Chip, streams: Collection[str], *, inertia: bool, tracers: bool) -> None:
         """Raise UsageError where the flow of a chip does not follow its pump by a factor, or no stream measures it."""
-        if not self.channel:
+        if not self.channels:
             return
-        where = f"pump.channel = {self.channel!r}"
-        name = self.channel.partition("/")[0]
-        if name not in streams:
-            there = ", ".join(sorted(streams)) or "none"
-            raise UsageError(f"{where}: there is no section [streams.{name}]; there are {there}")
+        where = f"pump.inlets = {list(self.inlets)}" if self.inlets else f"pump.channel = {self.channel!r}"
+        if self.inlets:
+            self._refuse_lists(chip, where, tracers=tracers)
+        for name in (channel.partition("/")[0] for channel in self.channels):
+            if name not in streams:
+                there = ", ".join(sorted(streams)) or "none"
+                raise UsageError(f"{where}: there is no section [streams.{name}]; there are {there}")
         outlets = {opening.value for opening in chip.openings if opening.kind == "outlet"}
         reason = ""
         if len(outlets) > 1:
@@ -75,21 +82,69 @@ class PumpFollower:
         if reason:
             raise UsageError(f"{where}: the flow of chip '{chip.name}' is not proportional to its pump's: {reason}")
 
-    def follow(self, last: Tick, tick: Tick, memory_s: float = 0.0) -> PumpShare | None:
+    def _refuse_lists(self, chip: Chip, where: str, *, tracers: bool) -> None:
+        count = sum(opening.kind == "inlet" for opening in chip.openings)
+        if self.channel:
+            raise UsageError(f"{where}: pump.channel is of one pump that feeds all inlets; leave one of both out")
+        if len(self.inlets) != count:
+            raise UsageError(f"{where}: chip '{chip.name}' has {count} inlets; name a channel for each")
+        if self.nominals and (len(self.nominals) != count or min(self.nominals) <= 0.0):
+            raise UsageError(f"pump.nominals = {list(self.nominals)}: give a value above 0 for each of {count} inlets")
+        if tracers:
+            raise UsageError(f"{where}: tracers follow one pump only; set tracker.tracers = false, or pump.channel")
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels that measure the pumps; none where nothing does."""
+        return self.inlets or ((self.channel,) if self.channel else ())
+
+    def follow(
+        self, last: Tick, tick: Tick, inlets: Superposition | None = None, memory_s: float = 0.0
+    ) -> PumpShare | None:
         """The share of this tick; None before the first sample. Of a stream that is silent the last value stays.
 
         `memory_s`: time over which a mean of the share can be asked for later, see `mean_share`.
         """
-        if not self.channel:
+        if not self.channels:
             return None
-        known, previous = self._measurement(last, tick), last.extra.get(PUMP)
+        previous = last.extra.get(PUMP)
         if not isinstance(previous, PumpShare):
-            if known is None:
-                return None
-            first = PumpShare(tick.stamp_ns, *(known[1][-1],) * 3, int(known[0][-1]))
-            if memory_s <= 0.0:
-                return first
-            return replace(first, mark_s=np.array([seconds(tick.stamp_ns)]), flowed_s=np.zeros(1))
+            previous = None
+        if inlets is not None:
+            return self._follow_each(last, tick, previous, inlets)
+        now = self._followed(last, tick, previous, self.channel, self.nominal)
+        if now is None or memory_s <= 0.0:
+            return now
+        if previous is None:
+            return replace(now, mark_s=np.array([seconds(tick.stamp_ns)]), flowed_s=np.zeros(1))
+        return _with_marks(previous, now, memory_s + self.delay_s)
+
+    def _follow_each(
+        self, last: Tick, tick: Tick, previous: PumpShare | None, inlets: Superposition
+    ) -> PumpShare | None:
+        """The shares of several pumps; one that has not told anything yet is as it was set, once another has."""
+        before = [None] * len(self.inlets) if previous is None else [*_rows(previous)]
+        nominals = self.nominals or (self.nominal,) * len(self.inlets)
+        each = [
+            self._followed(last, tick, row, channel, nominal)
+            for row, channel, nominal in zip(before, self.inlets, nominals, strict=True)
+        ]
+        if not any(each):
+            return None
+        as_set = PumpShare(tick.stamp_ns, 1.0, 1.0, 1.0, tick.stamp_ns)
+        known = [one or as_set for one in each]
+        shares = np.array([[one.share, one.slow_share, one.observed_share, seconds(one.sample_ns)] for one in known])
+        share, slow, observed = (inlets.mean(column) for column in shares.T[:3])
+        newest_ns = max(one.sample_ns for one in known)
+        return PumpShare(tick.stamp_ns, share, slow, observed, newest_ns, inlets=shares.ravel())
+
+    def _followed(
+        self, last: Tick, tick: Tick, previous: PumpShare | None, channel: str, nominal: float
+    ) -> PumpShare | None:
+        """The share that one channel tells; None before its first sample."""
+        known = self._measurement(last, tick, channel, nominal)
+        if previous is None:
+            return None if known is None else PumpShare(tick.stamp_ns, *(known[1][-1],) * 3, int(known[0][-1]))
         share, sample_ns = previous.share, previous.sample_ns
         for time_ns, value in zip(*known, strict=True) if known is not None else ():
             share += (value - share) * _weight(seconds(int(time_ns) - sample_ns), self.smoothing_s)
@@ -99,8 +154,7 @@ class PumpFollower:
         # The share is that much behind already.
         filter_s = max(_filter_s(last) - self.delay_s, 0.0)
         observed = previous.observed_share + (share - previous.observed_share) * _weight(dt_s, filter_s)
-        now = PumpShare(tick.stamp_ns, float(share), float(slow), float(observed), sample_ns)
-        return now if memory_s <= 0.0 else _with_marks(previous, now, memory_s + self.delay_s)
+        return PumpShare(tick.stamp_ns, float(share), float(slow), float(observed), sample_ns)
 
     def mean_share(self, pump: PumpShare, began_s: np.ndarray, ended_s: np.ndarray) -> np.ndarray:
         """(n,) means of the share over times (n,), (n,); what the sensor will tell within its delay is as it is now.
@@ -114,26 +168,38 @@ class PumpFollower:
         lasted_s = known_s[1] - known_s[0]
         return np.divide(ended - began, lasted_s, out=np.full(len(began_s), pump.share), where=lasted_s > 0.0)
 
-    def _measurement(self, last: Tick, tick: Tick) -> tuple[np.ndarray, np.ndarray] | None:
+    def _measurement(
+        self, last: Tick, tick: Tick, channel: str, nominal: float
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """Times and values, over the nominal one, of the samples of this tick; None without any."""
         samples, states = tick.extra.get(SAMPLES), tick.extra.get(STREAMS)
         if not isinstance(samples, Samples) or not isinstance(states, StreamStates):
             return None
-        if samples is last.extra.get(SAMPLES) or self.channel not in (names := states.channel_names()):
+        if samples is last.extra.get(SAMPLES) or channel not in (names := states.channel_names()):
             return None
-        mine = (samples.channel == names.index(self.channel)) & np.isfinite(samples.value)
+        mine = (samples.channel == names.index(channel)) & np.isfinite(samples.value)
         if not mine.any():
             return None
-        return samples.sample_ns[mine] - round(self.delay_s * NS_PER_S), samples.value[mine] / self.nominal
+        return samples.sample_ns[mine] - round(self.delay_s * NS_PER_S), samples.value[mine] / nominal
 
-    def at_nominal(self, before: Observations | None, now: Observations | None, pump: PumpShare) -> Observations | None:
+    def at_nominal(
+        self,
+        before: Observations | None,
+        now: Observations | None,
+        pump: PumpShare,
+        inlets: Superposition | None = None,
+    ) -> Observations | None:
         """Observations whose newest one is that of the nominal flow; those before it are already."""
         if now is None or now is before:
             return now
         share = pump.observed_share
         if share < _LEAST:
             return before
-        newest = self._over(now.only(slice(-1, None)), np.array([share]))
+        newest = now.only(slice(-1, None))
+        if inlets is not None:
+            away_um_s = inlets.departure_um_s(newest.position_um, _column(pump, _OBSERVED))
+            newest = replace(newest, flow_um_s=newest.flow_um_s - away_um_s)
+        newest = self._over(newest, np.array([share]))
         return newest if len(now.std_um_s) == 1 else now.only(slice(None, -1)).followed_by(newest)
 
     def stretches_at_nominal(
@@ -188,17 +254,33 @@ def at_share(flow: FlowField, share: float) -> FlowField:
     )
 
 
-def at_pump(flow: FlowField | None, pump: PumpShare | None) -> FlowField | None:
-    """A map as the pump drives it now."""
-    return flow if flow is None or pump is None else at_share(flow, pump.share)
+_NOW, _SLOW, _OBSERVED = range(3)  # of the numbers of an inlet
 
 
-def as_planned(tick: Tick) -> Tick:
+def _column(pump: PumpShare, which: int) -> Floats:
+    """(n,) numbers of the inlets."""
+    return pump.inlets.reshape(-1, 4)[:, which]
+
+
+def _rows(pump: PumpShare) -> Iterator[PumpShare]:
+    """The share of each inlet, as that of one pump."""
+    for share, slow, observed, sample_s in pump.inlets.reshape(-1, 4).tolist():
+        yield PumpShare(pump.stamp_ns, share, slow, observed, nanoseconds(sample_s))
+
+
+def at_pump(flow: FlowField | None, pump: PumpShare | None, inlets: Superposition | None = None) -> FlowField | None:
+    """A map as the pump drives it now, or the pumps of several inlets."""
+    if flow is None or pump is None:
+        return flow
+    return at_share(flow, pump.share) if inlets is None else inlets.at_shares(flow, _column(pump, _NOW))
+
+
+def as_planned(tick: Tick, inlets: Superposition | None = None) -> Tick:
     """The tick of an order with its maps at the slow mean of the pump's flow: for routes."""
     pump = tick.extra.get(PUMP)
     if not isinstance(pump, PumpShare):
         return tick
-    assumed, refined = (
-        None if each is None else at_share(each, pump.slow_share) for each in (tick.assumed, tick.refined)
-    )
-    return replace(tick, assumed=assumed, refined=refined)
+    slow = replace(pump, share=pump.slow_share)
+    if inlets is not None:
+        slow = replace(slow, inlets=np.repeat(_column(pump, _SLOW), 4))
+    return replace(tick, assumed=at_pump(tick.assumed, slow, inlets), refined=at_pump(tick.refined, slow, inlets))

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from flowrec.core.errors import UsageError
-from flowrec.core.messages import PUMP, SAMPLES, STREAMS, Observations, PumpShare, Samples, StreamStates
+from flowrec.core.messages import PUMP, SAMPLES, STREAMS, FlowField, Observations, PumpShare, Samples, StreamStates
 from flowrec.core.topics import Tick
 from flowrec.core.units import NS_PER_S
 from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.chip.fluid import PowerLaw
+from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.estimation.pump import PumpFollower, as_planned, at_share
+from flowrec.stages.estimation.pump import PumpFollower, as_planned, at_pump, at_share
+from flowrec.stages.estimation.superposition import Superposition
 
 STEP_S = 0.04
 
@@ -30,7 +32,9 @@ def channel(*values: float) -> Chip:
     return Chip("channel", mask, 10.0, (Opening("left", 6, 13, "inlet", 200.0), *outlets), 1.0, 1000.0)
 
 
-def flown(pump: PumpFollower, measured: list[float], memory_s: float = 0.0) -> list[PumpShare | None]:
+def flown(
+    pump: PumpFollower, measured: list[float], memory_s: float = 0.0, inlets: Superposition | None = None
+) -> list[PumpShare | None]:
     """The share at each tick, with one sample a tick, taken at the tick."""
     states = StreamStates(
         0,
@@ -48,7 +52,7 @@ def flown(pump: PumpFollower, measured: list[float], memory_s: float = 0.0) -> l
             place, times = np.array([0, 1], np.int32), np.array([stamp, stamp])
             new[SAMPLES] = Samples(stamp, place, times, np.array([99.0, value]), np.array([99.0, value]))
         tick = Tick(stamp, extra=last.extra.with_messages(new))  # type: ignore[arg-type]
-        share = pump.follow(last, tick, memory_s)
+        share = pump.follow(last, tick, inlets, memory_s)
         shares.append(share)
         last = tick if share is None else replace(tick, extra=tick.extra.with_messages({PUMP: share}))
     return shares
@@ -142,6 +146,75 @@ def test_a_flow_that_does_not_follow_its_pump_by_a_factor_is_refused(
 ) -> None:
     pump = PumpFollower("pump/flow")
     with pytest.raises(UsageError, match=complaint):
-        pump.refuse_unfit(chip, streams, inertia=True)
-    pump.refuse_unfit(channel(), ("pump",), inertia=True)
-    PumpFollower().refuse_unfit(chip, (), inertia=True)
+        pump.refuse_unfit(chip, streams, inertia=True, tracers=False)
+    pump.refuse_unfit(channel(), ("pump",), inertia=True, tracers=True)
+    PumpFollower().refuse_unfit(chip, (), inertia=True, tracers=True)
+
+
+def junction() -> Chip:
+    """A T: two inlets of 200 and 100 um/s at the left and the top, an outlet at the right."""
+    mask = np.zeros((40, 60), bool)
+    mask[24:32] = True
+    mask[:24, 26:32] = True
+    openings = (
+        Opening("left", 24, 31, "inlet", 200.0),
+        Opening("top", 26, 31, "inlet", 100.0),
+        Opening("right", 24, 31, "outlet", 0.0),
+    )
+    return Chip("junction", mask, 10.0, openings, 1.0, 1000.0)
+
+
+SOLVER = FlowSolver(convection=False)
+TWO = PumpFollower(inlets=("pump/other", "pump/flow"), nominals=(99.0, 10.0), smoothing_s=0.0, error_share=0.0)
+
+
+def driven(*shares: float) -> FlowField:
+    chip = junction()
+    values = (200.0 * shares[0], 100.0 * shares[1], 0.0)
+    openings = tuple(replace(each, value=value) for each, value in zip(chip.openings, values, strict=True))
+    return SOLVER.solve(replace(chip, openings=openings))
+
+
+def test_two_pumps_drive_the_sum_of_what_each_inlet_drives_alone() -> None:
+    inlets = Superposition.of(junction(), SOLVER)
+    shares = flown(TWO, [10.0, 5.0, 20.0], inlets=inlets)  # of the second one; the first tells its nominal value
+    for share, ratio in zip(shares, (1.0, 0.5, 2.0), strict=True):
+        assert share is not None and share.share == pytest.approx((1600.0 + 600.0 * ratio) / 2200.0)
+        now, true = at_pump(driven(1.0, 1.0), share, inlets), driven(1.0, ratio)
+        assert now is not None and now.velocity_um_s == pytest.approx(true.velocity_um_s, rel=1e-4, abs=5e-3)
+        assert now.pressure_pa == pytest.approx(true.pressure_pa, rel=1e-4, abs=1e-6)
+    # A refined map, here one a tenth faster, keeps what it has learned.
+    faster = at_share(driven(1.0, 1.0), 1.1)
+    both = replace(shares[0], share=2.0, inlets=np.array([2.0, 2.0, 2.0, 0.0] * 2))  # type: ignore[type-var]
+    assert at_pump(faster, both, inlets).velocity_um_s == pytest.approx(2.2 * driven(1.0, 1.0).velocity_um_s, rel=1e-4)  # type: ignore[union-attr]
+
+
+def test_what_the_robot_observes_between_two_pumps_is_the_nominal_flow() -> None:
+    inlets, place_um = Superposition.of(junction(), SOLVER), np.array([[290.0, 200.0], [450.0, 270.0], [100.0, 280.0]])
+    seen_um_s, nominal_um_s = sample(driven(1.0, 2.0), place_um), sample(driven(1.0, 1.0), place_um)
+    share = flown(TWO, [20.0], inlets=inlets)[0]
+    assert share is not None and abs(seen_um_s - nominal_um_s).max() > 50.0
+    for place, seen, nominal in zip(place_um, seen_um_s, nominal_um_s, strict=True):
+        one = Observations(1, place[None], seen[None], np.array([5.0]), None)
+        found = TWO.at_nominal(None, one, share, inlets)
+        assert found is not None and found.flow_um_s[0] == pytest.approx(nominal, rel=1e-3, abs=0.1)
+    planned = as_planned(Tick(1, assumed=driven(1.0, 1.0), extra=Tick().extra.with_messages({PUMP: share})), inlets)
+    assert planned.assumed is not None
+    assert planned.assumed.velocity_um_s == pytest.approx(driven(1.0, 2.0).velocity_um_s, rel=1e-4, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("pump", "tracers", "complaint"),
+    [
+        (replace(TWO, channel="pump/flow"), False, "pump.channel is of one pump that feeds all inlets"),
+        (replace(TWO, inlets=("pump/flow",)), False, "chip 'junction' has 2 inlets; name a channel for each"),
+        (replace(TWO, nominals=(1.0,)), False, r"pump\.nominals = \[1\.0\]: give a value above 0 for each of 2 inlets"),
+        (replace(TWO, nominals=(1.0, 0.0)), False, "give a value above 0"),
+        (TWO, True, "tracers follow one pump only"),
+        (replace(TWO, inlets=("pump/flow", "scale/flow")), False, r"there is no section \[streams\.scale\]"),
+    ],
+)
+def test_pumps_that_do_not_fit_the_inlets_are_refused(pump: PumpFollower, tracers: bool, complaint: str) -> None:
+    with pytest.raises(UsageError, match=complaint):
+        pump.refuse_unfit(junction(), ("pump",), inertia=False, tracers=tracers)
+    TWO.refuse_unfit(junction(), ("pump",), inertia=False, tracers=False)
