@@ -101,7 +101,7 @@ def test_a_session_without_streams_has_none_and_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("sets", "complaint"),
     [
-        (["streams.pump.kind=usb"], r"streams\.pump\.kind = 'usb': must be one of lsl, log, simulated"),
+        (["streams.pump.kind=usb"], r"streams\.pump\.kind = 'usb': must be one of lsl, serial, log, simulated"),
         (["streams.pump.outlett=x"], r"unknown key streams\.pump\.outlett; did you mean streams\.pump\.outlet"),
         (["streams.pump.silence_s=0"], r"streams\.pump\.silence_s = 0: must be from 0\.01"),
         (["streams.pump.on_silence=halt"], r"streams\.pump\.on_silence = 'halt': must be one of note, hold, stop"),

@@ -142,7 +142,7 @@ class SerialOutput:
         if not changed and now_s < self._due_s:
             return None
         self._due_s = now_s + self._settings.period_s
-        with self._connected() as port:
+        with self._open_port() as port:
             _ = port.in_waiting  # raises where the device is gone, also one that is never asked
         values = [self._ask(line) for line in self._settings.ask] or self._values
         now_ns = time.monotonic_ns()
@@ -162,15 +162,15 @@ class SerialOutput:
         port.close()
 
     def _send(self, line: str) -> None:
-        with self._connected() as port:
+        with self._open_port() as port:
             port.write(line.encode() + b"\n")
 
     def _ask(self, line: str) -> float:
         """The first number of the answer to a line."""
-        with self._connected() as port:
+        with self._open_port() as port:
             port.reset_input_buffer()
         self._send(line)
-        with self._connected() as port:
+        with self._open_port() as port:
             answer = port.readline(200)
         number = _NUMBER.search(answer)
         if number is None:
@@ -178,7 +178,7 @@ class SerialOutput:
         return float(number[0])
 
     @contextmanager
-    def _connected(self) -> Iterator[serial.Serial]:
+    def _open_port(self) -> Iterator[serial.Serial]:
         assert self._port is not None, "the stream is open"
         try:
             yield self._port

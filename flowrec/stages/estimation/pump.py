@@ -52,7 +52,9 @@ class PumpFollower:
     # value of the channel, in its unit, at which the inlets have the speeds that the chip states
     nominal: Annotated[float, Range(1e-12, 1e12)] = 1.0
     inlets: tuple[str, ...] = ()  # of several pumps: the channel of each inlet, in the order of the chip's openings
-    nominals: tuple[float, ...] = ()  # values of these channels at the speeds that the chip states; []: nominal for all
+    nominals: tuple[
+        Annotated[float, Range(1e-12, 1e12)], ...
+    ] = ()  # values of these channels at the speeds that the chip states; []: nominal for all
     error_share: Annotated[float, Range(0.0, 1.0)] = 0.02  # standard deviation of the measured value, as a ratio
     delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # time from a change of the flow to the sample that shows it
     smoothing_s: Annotated[float, Range(0.0, 60.0)] = 0.05  # memory of the mean over samples
@@ -88,8 +90,8 @@ class PumpFollower:
             raise UsageError(f"{where}: pump.channel is of one pump that feeds all inlets; leave one of both out")
         if len(self.inlets) != count:
             raise UsageError(f"{where}: chip '{chip.name}' has {count} inlets; name a channel for each")
-        if self.nominals and (len(self.nominals) != count or min(self.nominals) <= 0.0):
-            raise UsageError(f"pump.nominals = {list(self.nominals)}: give a value above 0 for each of {count} inlets")
+        if self.nominals and len(self.nominals) != count:
+            raise UsageError(f"pump.nominals = {list(self.nominals)}: give a value for each of {count} inlets")
         if tracers:
             raise UsageError(f"{where}: tracers follow one pump only; set tracker.tracers = false, or pump.channel")
 
@@ -112,7 +114,7 @@ class PumpFollower:
             previous = None
         if inlets is not None:
             return self._follow_each(last, tick, previous, inlets)
-        now = self._followed(last, tick, previous, self.channel, self.nominal)
+        now = self._share_of(last, tick, previous, self.channel, self.nominal)
         if now is None or memory_s <= 0.0:
             return now
         if previous is None:
@@ -126,7 +128,7 @@ class PumpFollower:
         before = [None] * len(self.inlets) if previous is None else [*_rows(previous)]
         nominals = self.nominals or (self.nominal,) * len(self.inlets)
         each = [
-            self._followed(last, tick, row, channel, nominal)
+            self._share_of(last, tick, row, channel, nominal)
             for row, channel, nominal in zip(before, self.inlets, nominals, strict=True)
         ]
         if not any(each):
@@ -138,7 +140,7 @@ class PumpFollower:
         newest_ns = max(one.sample_ns for one in known)
         return PumpShare(tick.stamp_ns, share, slow, observed, newest_ns, inlets=shares.ravel())
 
-    def _followed(
+    def _share_of(
         self, last: Tick, tick: Tick, previous: PumpShare | None, channel: str, nominal: float
     ) -> PumpShare | None:
         """The share that one channel tells; None before its first sample."""
