@@ -83,7 +83,7 @@ def judge(key: str, hint: Any, default: Any) -> None:
         default = (0.0, 0.0, 0.0, 0.0)
     if key in ("robot.speed_at_hz", "tracker.robots_px"):
         default = ((5.0, 100.0),)
-    if key.endswith((".rates_1_s", ".ratios")):
+    if key.endswith((".rates_1_s", ".ratios", ".nominals")):
         default = (1.0,)
     whole = isinstance(valid.low, int)
     below = valid.low - 1 if whole else math.nextafter(valid.low, -math.inf)
