@@ -7,8 +7,8 @@ The light that passes is the product of what each robot lets through,
 with disc and rim of disc_fit.py; radius r and darkness a of each are known from when it was alone. The places x are
 those of largest posterior probability, from where each robot is expected with a variance. Where one hides another, a
 small error of the model decides how far they seem apart; so their distance is kept as expected, and they are moved as
-one. Among all ways to exchange the robots that is kept whose cost is least, so that their looks tell them apart where
-their ways do not.
+one, unless the image contradicts that. Among all ways to exchange the robots that is kept whose cost is least, so that
+their looks tell them apart where their ways do not.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from flowrec.stages.vision.walls import Walls
 _ITERATIONS = 6  # of the Gauss-Newton steps
 _PERMUTED = 3  # robots at most whose exchange is tried: six ways
 _HIDDEN = 0.5  # of the sum of two radii: nearer robots hide each other
+_CONTRADICTS = 9.0  # of the cost, by which robots that hide each other must fit better at another distance: three sigma
 _MISFIT = 0.1  # of the background: standard deviation of a pixel about the model, whose neighbours err alike
 _ALIKE_PX = 9.0  # pixels that err alike
 _BOX_RADII = 1.8  # around the robots
@@ -65,28 +66,53 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
     precision = np.array([1.0 / max(body.variance_px2, _LEAST_VARIANCE_PX2) for body in bodies])
     apart = np.hypot(*(expected[:, None] - expected).transpose(2, 0, 1)) / (radii[:, None] + radii)
     as_one = bool((apart[np.triu_indices(len(bodies), 1)] < _HIDDEN).any())
-    as_they_are = [tuple(range(len(bodies)))]
-    orders = as_they_are if as_one or len(bodies) > _PERMUTED else itertools.permutations(range(len(bodies)))
-    moves = np.tile(np.eye(2), (len(bodies), 1)) if as_one else np.eye(2 * len(bodies))
-    best, least, residual = expected, np.inf, np.inf
-    for order in orders:
-        places = expected[list(order)].copy()
-        for _ in range(_ITERATIONS):
-            model, slopes = _light(part.pixels, places, radii, share)
-            off = part.grey - part.level * model
-            jacobian = part.level * slopes.reshape(len(off), -1)
-            normal = part.weight * jacobian.T @ jacobian + np.diag(np.repeat(precision, 2))
-            slope = part.weight * jacobian.T @ off - (precision[:, None] * (places - expected)).ravel()
-            move = (moves @ np.linalg.solve(moves.T @ normal @ moves, moves.T @ slope)).reshape(-1, 2)
-            longest = np.hypot(*move.T) / (0.5 * radii)  # a step is half a radius at most
-            places += move / np.maximum(longest, 1.0)[:, None]
-        left = float(((part.grey - part.level * _light(part.pixels, places, radii, share)[0]) ** 2).sum())
-        cost = part.weight * left + float((precision[:, None] * (places - expected) ** 2).sum())
-        if cost < least:
-            best, least, residual = places, cost, left
+    known = _Expected(expected, precision, radii, share)
+    one_by_one = np.eye(2 * len(bodies))
+    if as_one:
+        best = _fitted(part, known, expected, np.tile(np.eye(2), (len(bodies), 1)))
+        freely = _fitted(part, known, best.places, one_by_one)
+        best = freely if freely.cost < best.cost - _CONTRADICTS else best
+    else:
+        count = len(bodies)
+        orders = itertools.permutations(range(count)) if count <= _PERMUTED else [tuple(range(count))]
+        fits = [_fitted(part, known, expected[list(order)], one_by_one) for order in orders]
+        best = min(fits, key=lambda fit: fit.cost)
     variance = float(((part.grey - part.level) ** 2).sum())
-    shown = residual <= (1.0 - _LEAST_LIKENESS**2) * variance
-    return best if shown and np.isfinite(best).all() else None
+    shown = best.residual <= (1.0 - _LEAST_LIKENESS**2) * variance
+    return best.places if shown and np.isfinite(best.places).all() else None
+
+
+class _Expected(NamedTuple):
+    """What is known of n robots before the image."""
+
+    px: Floats  # (n, 2)
+    precision: Floats  # (n,) of that
+    radii: Floats
+    share: Floats  # of the light that each takes
+
+
+class _Fit(NamedTuple):
+    places: Floats  # (n, 2)
+    cost: float  # twice the negative logarithm of the posterior
+    residual: float  # sum of squares in grey levels
+
+
+def _fitted(part: _Image, known: _Expected, start: Floats, moves: Floats) -> _Fit:
+    """Gauss-Newton from a start (n, 2), by moves that are the columns of (2n, m)."""
+    places = start.copy()
+    for _ in range(_ITERATIONS):
+        model, slopes = _light(part.pixels, places, known.radii, known.share)
+        off = part.grey - part.level * model
+        jacobian = part.level * slopes.reshape(len(off), -1)
+        normal = part.weight * jacobian.T @ jacobian + np.diag(np.repeat(known.precision, 2))
+        slope = part.weight * jacobian.T @ off - (known.precision[:, None] * (places - known.px)).ravel()
+        move = (moves @ np.linalg.solve(moves.T @ normal @ moves, moves.T @ slope)).reshape(-1, 2)
+        longest = np.hypot(*move.T) / (0.5 * known.radii)  # a step is half a radius at most
+        places += move / np.maximum(longest, 1.0)[:, None]
+    model = _light(part.pixels, places, known.radii, known.share)[0]
+    left = float(((part.grey - part.level * model) ** 2).sum())
+    cost = part.weight * left + float((known.precision[:, None] * (places - known.px) ** 2).sum())
+    return _Fit(places, cost, left)
 
 
 def _part_of(
