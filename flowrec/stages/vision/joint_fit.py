@@ -26,7 +26,9 @@ from flowrec.stages.vision.walls import Walls
 _ITERATIONS = 6  # of the Gauss-Newton steps
 _PERMUTED = 3  # robots at most whose exchange is tried: six ways
 _HIDDEN = 0.5  # of the sum of two radii: nearer robots hide each other
-_CONTRADICTS = 9.0  # of the cost, by which robots that hide each other must fit better at another distance: three sigma
+_CONTRADICTS = (
+    2.0  # times the cost at another distance: then robots that hide each other are not as far apart as expected
+)
 _MISFIT = 0.1  # of the background: standard deviation of a pixel about the model, whose neighbours err alike
 _ALIKE_PX = 9.0  # pixels that err alike
 _BOX_RADII = 1.8  # around the robots
@@ -71,7 +73,7 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
     if as_one:
         best = _fitted(part, known, expected, np.tile(np.eye(2), (len(bodies), 1)))
         freely = _fitted(part, known, best.places, one_by_one)
-        best = freely if freely.cost < best.cost - _CONTRADICTS else best
+        best = freely if best.cost > _CONTRADICTS * freely.cost else best
     else:
         count = len(bodies)
         orders = itertools.permutations(range(count)) if count <= _PERMUTED else [tuple(range(count))]
