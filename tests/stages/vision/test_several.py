@@ -134,6 +134,22 @@ def test_of_robots_that_may_be_anywhere_nearby_their_looks_tell_which_is_which()
         assert each.seen and np.hypot(*(each.position_um / UM - place)) < 3.0
 
 
+def test_robots_that_part_from_each_other_otherwise_than_expected_are_both_found_again() -> None:
+    """They hide each other and are expected to come nearer, as by a wrong estimate of each, but they part."""
+    tracker, first = Tracker(robots=2, polarity="auto"), np.array([[60.0, 60.0], [90.0, 60.0]])
+    image = frame(first, 0)
+    tracks, look = tracker.follow_all([], [], None, image, CHIP, CALIBRATION, ROBOT, (0.0, 0.0), first[0] * UM)
+    near = [(74.0, 60.0), (79.0, 60.0)]
+    tracks = found_at(tracker, tracks, look, near, near, 1.0, 1)
+    apart, expected = [(73.0, 60.0), (80.5, 60.0)], [(76.0, 60.0), (78.0, 60.0)]
+    found = found_at(tracker, tracks, look, apart, expected, 1.0, 2)
+    assert max(np.hypot(*(each.position_um / UM - at)) for each, at in zip(found, apart, strict=True)) < 1.0
+    # A distance that the image does not contradict stays as expected, the two of them are moved.
+    expected = [(74.0, 62.0), (79.3, 62.0)]
+    kept = [each.position_um / UM for each in found_at(tracker, tracks, look, near, expected, 1.0, 2)]
+    assert kept[1] - kept[0] == pytest.approx([5.3, 0.0], abs=1e-6) and abs(kept[0][1] - 60.0) < 0.5
+
+
 def test_a_robot_that_is_looked_for_everywhere_does_not_take_a_disc_beside_one_that_was_seen_just_now() -> None:
     tracker, places = Tracker(robots=2, polarity="auto", reacquire_after=3), np.array([[60.0, 60.0], [140.0, 60.0]])
     first = frame(places, 0)
