@@ -26,9 +26,7 @@ from flowrec.stages.vision.walls import Walls
 _ITERATIONS = 6  # of the Gauss-Newton steps
 _PERMUTED = 3  # robots at most whose exchange is tried: six ways
 _HIDDEN = 0.5  # of the sum of two radii: nearer robots hide each other
-_CONTRADICTS = (
-    2.0  # times the cost at another distance: then robots that hide each other are not as far apart as expected
-)
+_CONTRADICTS = 2.0  # times the cost at another distance: robots that hide each other are not where they are expected
 _MISFIT = 0.1  # of the background: standard deviation of a pixel about the model, whose neighbours err alike
 _ALIKE_PX = 9.0  # pixels that err alike
 _BOX_RADII = 1.8  # around the robots
