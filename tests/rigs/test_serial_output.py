@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import serial
 
-from flowrec.core.errors import UsageError
+from flowrec.core.errors import RigError, UsageError
 from flowrec.core.messages import SAMPLES, SILENT, STREAMS, Applied
 from flowrec.rigs.streams.log import RunLog
 from flowrec.run.control import RunControl
@@ -91,6 +92,7 @@ def streams_of(control: RunControl, told: list[str], **device: Any) -> tuple[Str
         "kind": "serial",
         "channels": ["volt", "hertz"],
         "on_silence": "stop",
+        "wait_s": 0.3,
         "device": {**GENERATOR, **device},
     }
     config = load_config(None, {f"streams.generator.{name}": value for name, value in sets.items()})
@@ -173,6 +175,15 @@ def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_
                 break
     assert states[-1].state[0] == SILENT and control.reason == "stream generator is silent"
     assert any("the device on" in line and "does not answer" in line for line in told), told
+
+
+def test_a_port_that_another_has_opened_such_as_the_amplifier_gets_no_line() -> None:
+    device, told = Device(), list[str]()
+    streams, _, _ = streams_of(RunControl(), told, port=device.port)
+    with ExitStack() as stack, serial.Serial(device.port, exclusive=True):
+        with pytest.raises(RigError, match=r"streams\.generator: no device on .* lock port"):
+            streams.connect(stack)
+    assert device.lines == []
 
 
 @pytest.mark.parametrize(

@@ -119,9 +119,9 @@ class SerialOutput:
         self._ordered.set()
 
     def open(self) -> StreamHead:
-        name = self._settings.port
-        try:
-            self._port = serial.Serial(name, self._settings.baud, timeout=_ANSWER_S, write_timeout=_WRITE_S)
+        name, baud = self._settings.port, self._settings.baud
+        try:  # exclusively: the amplifier, which does so too, gets no line that is not meant for it
+            self._port = serial.Serial(name, baud, timeout=_ANSWER_S, write_timeout=_WRITE_S, exclusive=True)
         except (serial.SerialException, OSError) as error:
             raise NoStreamError(f"no device on {name!r}: {error}") from error
         for place, value in enumerate(self._values):
