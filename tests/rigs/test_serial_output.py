@@ -180,9 +180,9 @@ def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_
 def test_a_port_that_another_has_opened_such_as_the_amplifier_gets_no_line() -> None:
     device, told = Device(), list[str]()
     streams, _, _ = streams_of(RunControl(), told, port=device.port)
-    with ExitStack() as stack, serial.Serial(device.port, exclusive=True):
-        with pytest.raises(RigError, match=r"streams\.generator: no device on .* lock port"):
-            streams.connect(stack)
+    refused = pytest.raises(RigError, match=r"streams\.generator: no device on .* lock port")
+    with ExitStack() as stack, serial.Serial(device.port, exclusive=True), refused:
+        streams.connect(stack)
     assert device.lines == []
 
 
