@@ -66,24 +66,24 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
     precision = np.array([1.0 / max(body.variance_px2, _LEAST_VARIANCE_PX2) for body in bodies])
     apart = np.hypot(*(expected[:, None] - expected).transpose(2, 0, 1)) / (radii[:, None] + radii)
     as_one = bool((apart[np.triu_indices(len(bodies), 1)] < _HIDDEN).any())
-    known = _Expected(expected, precision, radii, share)
+    known = _Prior(expected, precision, radii, share)
     one_by_one = np.eye(2 * len(bodies))
     if as_one:
-        best = _fitted(part, known, expected, np.tile(np.eye(2), (len(bodies), 1)))
-        freely = _fitted(part, known, best.places, one_by_one)
+        best = _solve_places(part, known, expected, np.tile(np.eye(2), (len(bodies), 1)))
+        freely = _solve_places(part, known, best.places, one_by_one)
         best = freely if best.cost > _CONTRADICTS * freely.cost else best
     else:
         count = len(bodies)
         orders = itertools.permutations(range(count)) if count <= _PERMUTED else [tuple(range(count))]
-        fits = [_fitted(part, known, expected[list(order)], one_by_one) for order in orders]
+        fits = [_solve_places(part, known, expected[list(order)], one_by_one) for order in orders]
         best = min(fits, key=lambda fit: fit.cost)
     variance = float(((part.grey - part.level) ** 2).sum())
     shown = best.residual <= (1.0 - _LEAST_LIKENESS**2) * variance
     return best.places if shown and np.isfinite(best.places).all() else None
 
 
-class _Expected(NamedTuple):
-    """What is known of n robots before the image."""
+class _Prior(NamedTuple):
+    """Places and looks of n robots as they are expected before the image."""
 
     px: Floats  # (n, 2)
     precision: Floats  # (n,) of that
@@ -91,13 +91,13 @@ class _Expected(NamedTuple):
     share: Floats  # of the light that each takes
 
 
-class _Fit(NamedTuple):
+class _Solution(NamedTuple):
     places: Floats  # (n, 2)
     cost: float  # twice the negative logarithm of the posterior
     residual: float  # sum of squares in grey levels
 
 
-def _fitted(part: _Image, known: _Expected, start: Floats, moves: Floats) -> _Fit:
+def _solve_places(part: _Image, known: _Prior, start: Floats, moves: Floats) -> _Solution:
     """Gauss-Newton from a start (n, 2), by moves that are the columns of (2n, m)."""
     places = start.copy()
     for _ in range(_ITERATIONS):
@@ -112,7 +112,7 @@ def _fitted(part: _Image, known: _Expected, start: Floats, moves: Floats) -> _Fi
     model = _light(part.pixels, places, known.radii, known.share)[0]
     left = float(((part.grey - part.level * model) ** 2).sum())
     cost = part.weight * left + float((known.precision[:, None] * (places - known.px) ** 2).sum())
-    return _Fit(places, cost, left)
+    return _Solution(places, cost, left)
 
 
 def _part_of(
