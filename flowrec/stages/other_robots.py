@@ -8,7 +8,7 @@ speed of the command may be limited.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -22,6 +22,7 @@ from flowrec.core import (
     Estimate,
     FlowField,
     Message,
+    Observations,
     Range,
     RobotWalls,
     Tick,
@@ -30,8 +31,8 @@ from flowrec.core import (
 )
 from flowrec.physics import Robot
 from flowrec.stages.control.controller import clearance_and_slope
-from flowrec.stages.estimation import Observer
-from flowrec.stages.robot_topics import estimate_of, messages_of, track_of
+from flowrec.stages.estimation import Observer, Sampler
+from flowrec.stages.robot_topics import estimate_of, messages_of, observations_of_others, observations_topic, track_of
 from flowrec.stages.vision import Expected
 
 _OWN_ERROR = 0.3  # standard deviation of a robot's own displacement in a frame, as a ratio
@@ -50,6 +51,38 @@ class OtherRobots:
     # Largest speed of the mission's robot through the fluid while another robot is so near to a wall and the command
     # drives it there. None: no limit
     speed_limit_um_s: Annotated[float, Range(1.0, 1e6)] | None = None
+    # the motion of the others tells the flow, too; refinements find the um per revolution of each
+    observe_flow: bool = True
+
+    def collect(
+        self,
+        sampler: Sampler,
+        last: Tick,
+        estimates: Sequence[Estimate],
+        walls: RobotWalls,
+        robot: Robot,
+        pump: Callable[[Observations | None, Observations | None], Observations | None],
+    ) -> dict[str, Observations]:
+        """The new flow observations of the other robots, by path; none of one that is near a wall or out of view.
+
+        Parameters
+        ----------
+        pump : makes observations, given those before, to observations of the pump's nominal flow.
+        """
+        made: dict[str, Observations] = {}
+        told = last.extra.get(WALLS)
+        if not self.observe_flow or not isinstance(told, RobotWalls):
+            return made
+        known = observations_of_others(last)
+        free = np.isfinite(walls.wall_um) & (walls.near == 0.0) & np.isfinite(told.wall_um) & (told.near == 0.0)
+        for number in (np.flatnonzero(free) + 1).tolist():
+            before = estimate_of(last, number)
+            now = as_stated(estimates[number - 1], robot)
+            found = sampler.collect(known.get(number), None if before is None else as_stated(before, robot), now, robot)
+            found = pump(known.get(number), found)
+            if found is not None and found is not known.get(number):
+                made[observations_topic(number)] = found
+        return made
 
     def watch(
         self,
@@ -127,10 +160,33 @@ def expected_robots(last: Tick, count: int, applied: Applied, stamp_ns: int, rob
     return found
 
 
+def as_stated(estimate: Estimate, robot: Robot) -> Estimate:
+    """An estimate with a response of its own, as that of a robot of the stated um per revolution g0.
+
+    With the estimated one, g, and the mean turns u per second, the flow becomes v + (g - g0) u. The sum of flow and own
+    motion stays as it is: that is what images tell, whatever the response. The covariance is that of these unknowns.
+    """
+    if estimate.um_per_rev is None or not estimate.rolled_um_s.size:
+        return estimate
+    turns = estimate.rolled_um_s / estimate.um_per_rev
+    jacobian = np.eye(len(estimate.covariance))
+    jacobian[2:4, -1] = turns
+    return replace(
+        estimate,
+        flow_um_s=estimate.flow_um_s + (estimate.um_per_rev - robot.um_per_rev) * turns,
+        covariance=(jacobian @ estimate.covariance @ jacobian.T)[:-1, :-1],
+        um_per_rev=None,
+        rolled_um_s=robot.um_per_rev * turns,
+    )
+
+
 def observe_others(
     observer: Observer, last: Tick, tracks: Sequence[Track], applied: Applied, robot: Robot, flow: FlowField | None
 ) -> list[Estimate]:
-    """The estimates of the other robots, each by an observer of its own that finds its um per revolution, too."""
+    """The estimates of the other robots, each by an observer of its own that finds its um per revolution, too.
+
+    Without a `flow` by one that uses no map: what that says of the flow is a measurement.
+    """
     each = replace(observer, kalman=replace(observer.kalman, estimate_gain=True))
     return [
         each.estimate(estimate_of(last, number), track, applied, robot, flow)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flowrec.core import (
     FIXED,
     PUMP,
+    WALLS,
     Action,
     Appearance,
     Applied,
@@ -27,8 +28,11 @@ from flowrec.core import (
     Floats,
     FlowField,
     Frame,
+    Message,
     Observations,
     Phase,
+    PumpShare,
+    RobotWalls,
     Shift,
     Source,
     Tick,
@@ -265,6 +269,28 @@ def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track, rolled: Applied) ->
     return axes, steady_velocity(axes, map_um_s) + (np.zeros(2) if waits else leg_velocity(axes))
 
 
+def _follow_others(
+    p: Pipeline,
+    last: Tick,
+    tracks: Sequence[Track],
+    rolled: Applied,
+    flow: FlowField | None,
+    pump: PumpShare | None,
+) -> dict[str, Message]:
+    """The messages of the robots other than the first one, by path."""
+    if p.others.observe_flow and p.sampler.without_map:
+        flow = None
+    estimates = observe_others(p.observer, last, tracks, rolled, p.robot, flow)
+    radii_um = [each.radius_px * p.calibration.um_per_px for each in tracks]
+    walls = p.others.watch(last, tracks, estimates, p.robot, radii_um, p.clearance_um, p.chip.um_per_px)
+
+    def at_nominal(before: Observations | None, now: Observations | None) -> Observations | None:
+        return now if pump is None else p.pump.at_nominal(before, now, pump)
+
+    seen = p.others.collect(p.sampler, last, estimates, walls, p.robot, at_nominal)
+    return messages_of_others(tracks, estimates, walls) | seen
+
+
 def _no_lap(_stage: str) -> None:
     """Ignore the end of a stage."""
 
@@ -330,10 +356,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         tick = replace(tick, extra=tick.extra.with_messages({PUMP: pump}))
     walls = None
     if sight.others:
-        others = observe_others(p.observer, last, sight.others, rolled, p.robot, seen)
-        radii_um = [each.radius_px * p.calibration.um_per_px for each in sight.others]
-        walls = p.others.watch(last, sight.others, others, p.robot, radii_um, p.clearance_um, p.chip.um_per_px)
-        told = messages_of_others(sight.others, others, walls)
+        told = _follow_others(p, last, sight.others, rolled, seen, pump)
+        walls = told[WALLS]
+        assert isinstance(walls, RobotWalls)
         tick = replace(tick, extra=tick.extra.with_messages(told))
     tracer_flow = None
     if p.tracker.tracers:
