@@ -53,7 +53,7 @@ class ProcessWorker:
         mission, name = order_of(order)
         read = messages_read(order, name)
         needed: dict[str, Any] = {each: message for each, message in read.items() if each not in order.extra}
-        extra = Extra({path: message for path, message in read.items() if path in order.extra})
+        extra = Extra({path: message for path, message in order.extra.items() if path in read})
         self._orders.put(Tick(order.stamp_ns, mission=mission, extra=extra, **needed))
         self._fills.append(name)
 

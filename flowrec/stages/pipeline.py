@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from flowrec.core import (
     FIXED,
     PUMP,
-    WALLS,
     Action,
     Appearance,
     Applied,
@@ -276,8 +275,8 @@ def _follow_others(
     rolled: Applied,
     flow: FlowField | None,
     pump: PumpShare | None,
-) -> dict[str, Message]:
-    """The messages of the robots other than the first one, by path."""
+) -> tuple[RobotWalls, dict[str, Message]]:
+    """Where the robots other than the first one are beside walls, and all messages of them, by path."""
     if p.others.observe_flow and p.sampler.without_map:
         flow = None
     estimates = observe_others(p.observer, last, tracks, rolled, p.robot, flow)
@@ -288,7 +287,7 @@ def _follow_others(
         return now if pump is None else p.pump.at_nominal(before, now, pump)
 
     seen = p.others.collect(p.sampler, last, estimates, walls, p.robot, at_nominal)
-    return messages_of_others(tracks, estimates, walls) | seen
+    return walls, messages_of_others(tracks, estimates, walls) | seen
 
 
 def _no_lap(_stage: str) -> None:
@@ -356,9 +355,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         tick = replace(tick, extra=tick.extra.with_messages({PUMP: pump}))
     walls = None
     if sight.others:
-        told = _follow_others(p, last, sight.others, rolled, seen, pump)
-        walls = told[WALLS]
-        assert isinstance(walls, RobotWalls)
+        walls, told = _follow_others(p, last, sight.others, rolled, seen, pump)
         tick = replace(tick, extra=tick.extra.with_messages(told))
     tracer_flow = None
     if p.tracker.tracers:
