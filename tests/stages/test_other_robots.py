@@ -120,8 +120,11 @@ def test_topics_are_those_of_the_first_robot_with_a_number() -> None:
     topics = {topic.path: topic for topic in robot_topics(config)}
     assert set(topics) == {
         *("/robot/1/track", "/robot/1/estimate", "/robot/2/track", "/robot/2/estimate"),
+        *("/robot/1/observations", "/robot/2/observations"),
         *("/robots/walls", "/truth/robot/1", "/truth/robot/2"),
     }
+    unasked = {topic.path for topic in robot_topics(load_config(None, [*SEVERAL, "others.observe_flow=false"]))}
+    assert unasked == {path for path in topics if not path.endswith("/observations")}
     assert topics["/robot/2/track"].type is Track and topics["/truth/robot/1"].source is Source.SIMULATOR
     assert [robot_number(path) for path in ("/robot/12/track", "/robot/track", "/truth/robot/3", "/robots/walls")] == [
         *(12, 0, 3, 0)
