@@ -137,6 +137,12 @@ def _wall(
     return middle_um - radius_um, slope / size if size > 0.0 else np.zeros(2)
 
 
+def expected_unmoved(track: Track, robot: Robot, stamp_ns: int) -> Expected:
+    """The place where a robot of which only tracks are known is expected: where it was, and as far as it swims."""
+    far_um = robot.max_speed_um_s * max(seconds(stamp_ns - track.stamp_ns), 0.0)
+    return Expected(track.position_um, min(math.hypot(far_um, _STD_RADII * robot.radius_um), _FARTHEST_UM))
+
+
 def expected_robots(last: Tick, count: int, applied: Applied, stamp_ns: int, robot: Robot) -> list[Expected]:
     """The places where the robots are expected now: from those seen on the tick before, else from their estimates."""
     found = []

@@ -58,6 +58,7 @@ from flowrec.stages.inputs import FROM_IMAGE, Inputs, with_inputs
 from flowrec.stages.other_robots import (
     OtherRobots,
     expected_robots,
+    expected_unmoved,
     messages_of_others,
     observe_others,
     tracks_of_others,
@@ -202,6 +203,7 @@ def look(p: Pipeline, last: Sight, frame: Frame, expected: Sequence[Expected] = 
     others: list[Track] = []
     if p.tracker.count > 1:
         seen = [] if previous is None else [previous, *last.others]
+        expected = expected or [expected_unmoved(track, p.robot, frame.stamp_ns) for track in seen]
         (first, *others), appearance = p.tracker.follow_all(
             seen, expected, last.appearance, frame, p.chip, p.calibration, p.robot, off_px, np.array(p.mission.start)
         )
