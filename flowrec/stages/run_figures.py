@@ -29,7 +29,7 @@ from flowrec.core import (
 from flowrec.physics import Chip, Robot, relative_rmse
 from flowrec.stages.planning.planner import Planner
 from flowrec.stages.planning.survey_ways import METHOD as SURVEY_ROUTE
-from flowrec.stages.robot_topics import observations_topic, robot_topic, track_of
+from flowrec.stages.robot_topics import observations_topic, track_of
 
 CHAIN = ("arrived", "tracked", "commanded", "on the wire", "field")  # stages of the latency, after the exposure
 
@@ -51,6 +51,7 @@ class RobotStatistics:
         self._images = self._seen = self._alarms = self._observations = 0
         self._was_near = False
         self._nearest_um = math.inf
+        self._true = ""  # path of the truth of this robot; '': not known
         self._contacts: int | None = None  # None: the truth is not known
 
     def write(self, tick: Tick, track: Track) -> None:
@@ -58,13 +59,18 @@ class RobotStatistics:
         if track.stamp_ns == tick.stamp_ns:
             self._images += 1
             self._seen += track.seen
-        walls, truth = tick.extra.get(WALLS), tick.extra.get(robot_topic("/truth/robot", self._number))
+        walls = tick.extra.get(WALLS)
         if isinstance(walls, RobotWalls) and self._number <= len(walls.near):
             near = bool(walls.near[self._number - 1])
             self._alarms += near and not self._was_near
             self._was_near = near
             if track.seen:
                 self._nearest_um = max(float(np.fmin(self._nearest_um, walls.wall_um[self._number - 1])), 0.0)
+        if track.seen and not self._true:  # numbers of true robots are not those of the tracks
+            truths = {path: each for path, each in tick.extra.items() if isinstance(each, Truth)}
+            off_um = {path: math.dist(each.position_um, track.position_um) for path, each in truths.items()}
+            self._true = min(off_um, key=lambda path: off_um[path], default="")
+        truth = tick.extra.get(self._true)
         if isinstance(truth, Truth):
             self._contacts = truth.contacts
         observations = tick.extra.get(observations_topic(self._number))
