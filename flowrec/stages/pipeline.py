@@ -278,7 +278,7 @@ def _follow_others(
     flow: FlowField | None,
     pump: PumpShare | None,
 ) -> tuple[RobotWalls, dict[str, Message]]:
-    """Where the robots other than the first one are beside walls, and all messages of them, by path."""
+    """The distances of the robots other than the first one from walls, and all messages of them, by path."""
     if p.others.observe_flow and p.sampler.without_map:
         flow = None
     estimates = observe_others(p.observer, last, tracks, rolled, p.robot, flow)

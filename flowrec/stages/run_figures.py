@@ -44,7 +44,7 @@ def chain_ms(timing: Timing) -> tuple[float, ...]:
 
 
 class RobotStatistics:
-    """What became of a robot other than the first one, of all ticks."""
+    """Figures of a robot other than the first one, from all ticks."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -82,7 +82,7 @@ class RobotStatistics:
         """In words: share of the images in which it was tracked, alarms, walls, observations."""
         words = [f"tracked in {self._seen / max(self._images, 1):.0%} of {self._images} images"]
         if math.isfinite(self._nearest_um):
-            words.append(f"{self._nearest_um:.0f} um from a wall at the least")
+            words.append(f"at least {self._nearest_um:.0f} um from walls")
         counts = {"alarm near walls": self._alarms, "wall contact": self._contacts}
         if self._observations:
             counts["flow observation"] = self._observations

@@ -160,7 +160,7 @@ def _with_robots(asked: Config, p: Pipeline, movie: MovieSettings, prepared: Pre
     with MovieSource(movie, prepared.config.coils) as source:
         image = next(iter(_within(source, prepared)))
     candidates, _ = _candidates(p, image, look(alone, Sight(), image))
-    places_px = [_place_of(each, asked, p) or _numbered(each, candidates, image, asked) for each in robots]
+    places_px = [_place_of(each, asked, p) or _place_of_number(each, candidates, image, asked) for each in robots]
     count = max(asked.tracker.robots, len(places_px))
     found = replace(p, tracker=replace(p.tracker, robots=count, robots_px=tuple(places_px)))
     sight = look(found, Sight(), image)
@@ -175,7 +175,7 @@ def _with_robots(asked: Config, p: Pipeline, movie: MovieSettings, prepared: Pre
     return replace(asked, tracker=replace(asked.tracker, robots=count, robots_px=tuple(places_px)))
 
 
-def _numbered(robot: str, places_px: Floats, image: Frame, asked: Config) -> tuple[float, float]:
+def _place_of_number(robot: str, places_px: Floats, image: Frame, asked: Config) -> tuple[float, float]:
     """The place of a number of the picture."""
     number = int(robot)
     if not 1 <= number <= len(places_px):
@@ -299,7 +299,7 @@ def _with_chosen_body(asked: Config, p: Pipeline, image: Frame, sight: Sight, ro
             warn(f"{name}: the robot in image {image.index} has {size}")
         return asked
     if robot:
-        at_px = _numbered(robot, places, image, asked)
+        at_px = _place_of_number(robot, places, image, asked)
         if size := _size_text(p, image.image, np.array(at_px)):
             warn(f"{name}: body {robot} of image {image.index} has {size}")
         return replace(asked, tracker=replace(asked.tracker, click_px=at_px, click_frame=image.index))

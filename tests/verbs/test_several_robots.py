@@ -106,6 +106,7 @@ def test_the_first_robot_may_be_replayed_alone(mission: Path) -> None:
     assert status == 0, said
     session = flowrec.open(mission.with_name("one.mcap"))
     assert session.topics["/robot/track"] > 30 and "/robot/1/track" not in session.topics
+    assert not any(key.startswith("robot_") for key in session.outcome)
 
 
 def test_tables_have_one_for_each_robot_and_its_truth(mission: Path, tmp_path: Path) -> None:
@@ -118,6 +119,9 @@ def test_tables_have_one_for_each_robot_and_its_truth(mission: Path, tmp_path: P
         )
         assert track.num_rows == truth.num_rows > 30
         assert {"position_x_um", "seen"} <= set(track.column_names), track.column_names
+        observed = pyarrow.parquet.read_table(tmp_path / "tables" / f"observed_flow.robot.{number}.parquet")
+        last = flowrec.open(mission).last.extra[robot_topic("/robot/observations", number)]
+        assert observed["x_um"].to_pylist() == last.position_um[:, 0].tolist()
     assert np.isfinite(track["score"].to_numpy()).all()
 
 
@@ -179,4 +183,3 @@ def test_a_line_for_each_other_robot_ends_a_run_and_stands_in_its_session(missio
         assert f", {truth.contacts} wall contact" in text
     status, said = run("info", mission)
     assert status == 0 and "robot 1" in said and "tracked in" in said
-    assert not any(key.startswith("robot_") for key in flowrec.open(mission.with_name("one.mcap")).outcome)
