@@ -269,3 +269,23 @@ def test_an_order_has_the_observations_of_all_robots_and_the_process_that_does_i
     read = messages_read(replace(last, extra=last.extra.with_messages({PUMP: pump})), "refined")
     assert read[PUMP] is pump and all(read[robot_topic("/robot/observations", k)] is each for k, each in others.items())
     assert "/robot/1/track" not in read and not messages_read(last, "assumed")
+
+
+def test_an_observation_is_less_certain_while_the_own_motion_of_a_robot_of_unknown_lag_changes() -> None:
+    told = RobotWalls(0, np.array([30.0]), np.zeros(1), np.zeros(1))
+    stds = {}
+    for change in (0.0, 10.0):
+        estimates = [
+            replace(
+                estimate(MIDDLE_UM, 25.0, (50.0, 0.0), stamp_ns),
+                covariance=np.eye(5),
+                rolled_um_s=np.array([100.0 + change * (stamp_ns > 0), 0.0]),
+            )
+            for stamp_ns in (0, 40_000_000)
+        ]
+        last = Tick(extra=Extra({WALLS: told, **messages_of(1, track(MIDDLE_UM), estimates[0])}))
+        (made,) = OtherRobots().collect(Sampler(), last, [estimates[1]], told, ROBOT, lambda _, found: found).values()
+        stds[change] = float(made.std_um_s[-1])
+    assert stds[0.0] == pytest.approx(math.hypot(7.0, 2.8), rel=0.05), "uneven rolling, and the sampler's own"
+    late_um_s = ROBOT.delay_s * 10.0 / 0.04
+    assert stds[10.0] == pytest.approx(math.hypot(stds[0.0], late_um_s), rel=0.05)
