@@ -13,13 +13,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowrec.core import Floats, Phase, Tick, printable, seconds, shift_px, with_micro
-from flowrec.view import Batch, Scene, encode_jpeg, goal_of, state_text, way_of
+from flowrec.core import WALLS, Estimate, Floats, Phase, RobotWalls, Tick, printable, seconds, shift_px, with_micro
+from flowrec.stages import estimates_of_others
+from flowrec.view import Batch, Scene, encode_jpeg, goal_of, of_robot, state_text, way_of
 
 # What the page shows depends on these fields of a tick.
 SHOWN = (
     *("frame", "shift", "refined", "route", "estimate", "mission", "demand"),
-    *("currents", "event", "timing", "losses"),
+    *("currents", "event", "timing", "losses", "extra"),
 )
 _QUALITY = 80  # of the JPEG
 _EDGE_PX = 3  # by which the mask goes on beyond its border, so that its openings are not drawn as walls
@@ -83,7 +84,7 @@ class PageState:
         """Content that changes with each tick."""
         tick, mission, estimate = self.tick, self.tick.mission, self.tick.estimate
         field = tick.currents
-        at = None if estimate is None else (self._scene.to_plane(estimate.position_um) + shift_px(tick.shift)).tolist()
+        at = None if estimate is None else self._place(estimate)
         error_um = tick.demand.error_um if tick.demand is not None else math.nan
         by_hand = mission is not None and mission.by_hand
         return {
@@ -92,8 +93,9 @@ class PageState:
             "waits_for": mission.wanted.replace("_", " ") if mission is not None else "",
             "held": mission is not None and mission.held_since_ns is not None,
             "observing": mission is not None and mission.phase == Phase.OBSERVE,
-            "robot": None if at is None or not np.isfinite(at).all() else [round(each, 1) for each in at],
+            "robot": at,
             "seen": estimate is not None and estimate.seen,
+            "others": self._others(),
             "error_um": round(error_um) if math.isfinite(error_um) and not by_hand else None,
             "field": "off"
             if field is None or field.amplitude_mt == 0.0
@@ -109,6 +111,26 @@ class PageState:
         if frame is None or not frame.image.size:
             return None
         return bytes([min(self._step, 255)]) + encode_jpeg(frame.image, frame.bits, _QUALITY)
+
+    def _place(self, estimate: Estimate) -> list[float] | None:
+        """The pixel of a robot; None where it is not known."""
+        at = (self._scene.to_plane(estimate.position_um) + shift_px(self.tick.shift)).tolist()
+        return [round(each, 1) for each in at] if np.isfinite(at).all() else None
+
+    def _others(self) -> list[dict[str, Any]]:
+        """The robots beside the mission's one: number, pixel, colour, whether it is seen, and near a wall."""
+        walls = self.tick.extra.get(WALLS)
+        near = walls.near.tolist() if isinstance(walls, RobotWalls) else []
+        return [
+            {
+                "number": number,
+                "at": self._place(estimate),
+                "colour": f"rgb{of_robot(number)}",
+                "seen": estimate.seen,
+                "near": number <= len(near) and bool(near[number - 1]),
+            }
+            for number, estimate in enumerate(estimates_of_others(self.tick), start=1)
+        ]
 
     def _losses(self) -> list[str]:
         timing, losses = self.tick.timing, self.tick.losses

@@ -37,6 +37,7 @@ _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
 _ASSIMILATED = "assimilated "  # before the number of observations, at the begin of the note of a refined map
 _UM = re.compile(r"(?<![\w.])um\b")
+_ROBOT = re.compile(r"robot_\d{1,4}")  # keys of the figures of other robots, which are text
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
 DOUBTS = "doubts"  # key of the outcome of a session: why its result is doubtful; absent: it is not
 # Names of keys that would be misread as words.
@@ -104,6 +105,16 @@ def name_of(key: str) -> str:
         return _NAMES[key]
     unit = next((unit for unit in _UNITS if key.endswith(unit) and unit != "_error"), "")
     return key.removesuffix(unit).replace("_", " ")
+
+
+def is_of_robot(key: str) -> bool:
+    """True for the key of the figures of a robot other than the first one."""
+    return _ROBOT.fullmatch(key) is not None
+
+
+def robot_lines(figures: Mapping[str, Value]) -> list[str]:
+    """A line for each robot other than the first one."""
+    return [f"{name_of(key)}: {value}" for key, value in figures.items() if is_of_robot(key)]
 
 
 def text_of_figure(key: str, value: Value) -> str:

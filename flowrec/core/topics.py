@@ -47,7 +47,7 @@ _SOLVE = SlowStage({WorkOrder.SOLVE: ("flow", "refine.assimilate")}, reads=(), s
 _REFINE = SlowStage(
     {WorkOrder.REFINE: ("sampler", "flow", "refine")},
     reads=("assumed", "refined", "observations", "tracer_flow"),
-    settings=("stabilise", "tracker", "observer", "sampler", "refine", "mission"),
+    settings=("stabilise", "tracker", "observer", "sampler", "others", "refine", "mission"),
 )
 _PLAN = SlowStage(
     {

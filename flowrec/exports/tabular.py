@@ -22,6 +22,7 @@ import pyarrow.parquet
 
 from flowrec.core import SessionError, __version__, seconds, summary_of
 from flowrec.exports.formats import TimeProgress
+from flowrec.stages import observations_of_others
 from flowrec.store import Session, field_values, has_streams, observed_flow, sample_batches, sample_schema
 
 _RUN = "^[=+\\-@\t\r'＝＋－＠]"  # what a text begins with that a spreadsheet may take for a formula
@@ -91,10 +92,12 @@ def _places(session: Session) -> Iterator[tuple[str, pa.Table, str]]:
     for name, field in session.fields.items():
         meaning = f"the {name} flow field, at the centres of the fluid pixels; method {field.method}"
         yield f"field_{name}", field_values(field, session.chip.mask), meaning
-    observations = session.reader.tick_before(session.run.last_ns, with_frames=False).observations
-    if observations is not None:
-        meaning = "the latest observations of the flow, a row each, as flowrec.refine reads them"
-        yield "observed_flow", observed_flow(observations), meaning
+    last = session.reader.tick_before(session.run.last_ns, with_frames=False)
+    meaning = "the latest observations of the flow{}, a row each, as flowrec.refine reads them"
+    if last.observations is not None:
+        yield "observed_flow", observed_flow(last.observations), meaning.format("")
+    for number, observations in sorted(observations_of_others(last).items()):
+        yield f"observed_flow.robot.{number}", observed_flow(observations), meaning.format(f" by robot {number}")
 
 
 class ParquetExport(_Tables):

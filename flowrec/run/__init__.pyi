@@ -19,6 +19,7 @@ from .watchdog import Watchdog as Watchdog
 from .worker_process import ProcessWorker as ProcessWorker
 from .workers import (
     LockstepWorker as LockstepWorker, Preloaded as Preloaded, ReplayWorker as ReplayWorker, Worker as Worker,
+    messages_read as messages_read,
     work as work,
 )
 

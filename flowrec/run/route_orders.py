@@ -9,7 +9,16 @@ import numpy as np
 
 from flowrec.core import Mission, Observations, Phase, Route, Tick, seconds
 from flowrec.physics import FlowUncertainty
-from flowrec.stages import Pipeline, Sampling, SurveyOrder, better_route, memory_s, robot_at, route_elsewhere
+from flowrec.stages import (
+    Pipeline,
+    Sampling,
+    SurveyOrder,
+    better_route,
+    memory_s,
+    observations_of_others,
+    robot_at,
+    route_elsewhere,
+)
 
 _RECENT = 20  # observations, of which the noise of the next ones is expected
 
@@ -20,12 +29,13 @@ def no_observations(stamp_ns: int) -> Observations:
 
 
 def observations_of(pipeline: Pipeline, order: Tick) -> Observations:
-    """The observations that a refinement is given: of the robot, and of tracers where they are followed."""
+    """The observations that a refinement is given: of all robots, and of tracers where they are followed."""
     if pipeline.hindsight is not None:
         own = pipeline.hindsight(order.stamp_ns)
     else:
         own = pipeline.sampler.treat(order.observations or no_observations(order.stamp_ns))
-    return own.with_tracers(order.tracer_flow)
+    others = {number: pipeline.sampler.treat(each) for number, each in observations_of_others(order).items()}
+    return own.with_robots(others).with_tracers(order.tracer_flow)
 
 
 def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:

@@ -16,11 +16,12 @@ import threading
 import traceback
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from flowrec.core import WORKER_FIELDS, ChildEndedError, ChildProcess, FlowrecError, Parent, Tick
-from flowrec.run.workers import Results, order_of, work
+from flowrec.core import ChildEndedError, ChildProcess, Extra, FlowrecError, Parent, Tick
+from flowrec.run.workers import Results, messages_read, order_of, work
 from flowrec.stages import Pipeline, warm_up
 
 _NAME = "the process that solves and plans"
@@ -50,8 +51,10 @@ class ProcessWorker:
     def submit(self, order: Tick) -> None:
         """Start on an order as soon as those before it are done."""
         mission, name = order_of(order)
-        needed = {field: getattr(order, field) for field in WORKER_FIELDS[name].reads}
-        self._orders.put(Tick(order.stamp_ns, mission=mission, **needed))
+        read = messages_read(order, name)
+        needed: dict[str, Any] = {each: message for each, message in read.items() if each not in order.extra}
+        extra = Extra({path: message for path, message in order.extra.items() if path in read})
+        self._orders.put(Tick(order.stamp_ns, mission=mission, extra=extra, **needed))
         self._fills.append(name)
 
     def due(self, stamp_ns: int) -> Results:

@@ -22,6 +22,7 @@ from flowrec.core import (
     NotFiniteError,
     Observations,
     Phase,
+    PumpShare,
     Route,
     Tick,
     WorkOrder,
@@ -41,6 +42,13 @@ def order_of(tick: Tick) -> tuple[Mission, str]:
     return tick.mission, ANSWERED_BY[WorkOrder(tick.mission.wanted)]
 
 
+def messages_read(order: Tick, name: str) -> dict[str, Message | None]:
+    """The messages of the ordering tick, besides the mission, of which a result is made, by field or path."""
+    read = WORKER_FIELDS[name].reads
+    extra = {path: each for path, each in order.extra.items() if isinstance(each, PumpShare | Observations)}
+    return {each: getattr(order, each) for each in read} | (extra if read else {})
+
+
 @one_blas_thread()
 def work(pipeline: Pipeline, order: Tick) -> Result:
     """Do what `order.mission` wants with what was known in that tick; the result has the order's stamp and number.
@@ -54,8 +62,7 @@ def work(pipeline: Pipeline, order: Tick) -> Result:
     """
     mission, name = order_of(order)
     try:
-        for each in ("mission", *WORKER_FIELDS[name].reads):
-            message = getattr(order, each)
+        for message in (mission, *messages_read(order, name).values()):
             if message is not None and not isinstance(message, Observations):  # of those the finite ones count
                 message.refuse_not_finite()  # the numerics would raise anything, or return what is of no worth
         result = _compute(pipeline, order, mission)
@@ -196,11 +203,13 @@ class ReplayWorker(LockstepWorker):
         super().submit(order)
         if self._order is order:
             mission, name = order_of(order)
-            recorded, read = self._recorded(), ("mission", *WORKER_FIELDS[name].reads)
+            one, other = messages_read(order, name), messages_read(self._recorded(), name)
             self._unchanged = (
                 mission.wanted in self._same
-                and order.stamp_ns == recorded.stamp_ns
-                and all(_alike(getattr(order, each), getattr(recorded, each)) for each in read)
+                and order.stamp_ns == self._recorded().stamp_ns
+                and _alike(mission, self._recorded().mission)
+                and one.keys() == other.keys()
+                and all(_alike(message, other[each]) for each, message in one.items())
             )
 
     def _result(self, order: Tick) -> Result:

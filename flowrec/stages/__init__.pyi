@@ -54,7 +54,10 @@ from .planning.survey import SurveyPlanner as SurveyPlanner
 from .planning.survey_design import (
     Need as Need, Sampling as Sampling, SurveyOrder as SurveyOrder, covariance_after as covariance_after,
 )
-from .robot_topics import estimates_of_others as estimates_of_others, robot_number as robot_number, robot_topic as robot_topic
+from .robot_topics import (
+    estimates_of_others as estimates_of_others, observations_of_others as observations_of_others,
+    robot_number as robot_number, robot_topic as robot_topic,
+)
 from .refine.case import Case as Case
 from .refine.findings import map_doubts as map_doubts
 from .refine.network import UNet as UNet, trained_network as trained_network

@@ -173,6 +173,7 @@ _BEFORE: dict[str, Any] = {
     "plan.policy_points_per_px": 4,
     "health.step_out.learned": False,
     "sampler.without_map": False,
+    "others.observe_flow": False,
     "refine.place_robot": False,
     "refine.correct_robot": False,
     "refine.correct_heading": False,

@@ -8,7 +8,7 @@ speed of the command may be limited.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -22,6 +22,7 @@ from flowrec.core import (
     Estimate,
     FlowField,
     Message,
+    Observations,
     Range,
     RobotWalls,
     Tick,
@@ -30,14 +31,15 @@ from flowrec.core import (
 )
 from flowrec.physics import Robot
 from flowrec.stages.control.controller import clearance_and_slope
-from flowrec.stages.estimation import Observer
-from flowrec.stages.robot_topics import estimate_of, messages_of, track_of
+from flowrec.stages.estimation import Observer, Sampler
+from flowrec.stages.robot_topics import estimate_of, messages_of, observations_of_others, observations_topic, track_of
 from flowrec.stages.vision import Expected
 
 _OWN_ERROR = 0.3  # standard deviation of a robot's own displacement in a frame, as a ratio
 _STD_RADII = 0.12  # least error of an expected place
 _FARTHEST_UM = 1e5  # standard deviation of a place of which nothing is known
 _SEEN_S = 1.0  # a robot that was not seen for longer may be anywhere
+_UNEVEN = 0.07  # of its own speed: runs of a roller differ by 5 to 10 % in um per revolution
 _OVER = 1.6  # of the distance at which an alarm begins: there it ends
 
 
@@ -50,6 +52,41 @@ class OtherRobots:
     # Largest speed of the mission's robot through the fluid while another robot is so near to a wall and the command
     # drives it there. None: no limit
     speed_limit_um_s: Annotated[float, Range(1.0, 1e6)] | None = None
+    # the motion of the others tells the flow, too; refinements find the um per revolution of each
+    observe_flow: bool = True
+
+    def collect(
+        self,
+        sampler: Sampler,
+        last: Tick,
+        estimates: Sequence[Estimate],
+        walls: RobotWalls,
+        robot: Robot,
+        pump: Callable[[Observations | None, Observations | None], Observations | None],
+    ) -> dict[str, Observations]:
+        """The new flow observations of the other robots, by path; none of one that is near a wall or out of view.
+
+        Parameters
+        ----------
+        pump : makes observations, given those before, to observations of the pump's nominal flow.
+        """
+        made: dict[str, Observations] = {}
+        told = last.extra.get(WALLS)
+        if not self.observe_flow or not isinstance(told, RobotWalls):
+            return made
+        known = observations_of_others(last)
+        free = np.isfinite(walls.wall_um) & (walls.near == 0.0) & np.isfinite(told.wall_um) & (told.near == 0.0)
+        for number in (np.flatnonzero(free) + 1).tolist():
+            before = estimate_of(last, number)
+            if before is None:
+                continue
+            past, now = as_stated(before, robot), as_stated(estimates[number - 1], robot)
+            found = sampler.collect(known.get(number), past, now, robot)
+            if found is not None and found is not known.get(number):
+                found = pump(known.get(number), _with_unknown_response(found, past, now, robot))
+            if found is not None and found is not known.get(number):
+                made[observations_topic(number)] = found
+        return made
 
     def watch(
         self,
@@ -84,6 +121,21 @@ class OtherRobots:
         return RobotWalls(tracks[0].stamp_ns, distance_um, near_ones, towards_um_s, limit_um_s)
 
 
+def _with_unknown_response(made: Observations, past: Estimate, now: Estimate, robot: Robot) -> Observations:
+    """Observations whose newest one has the error of a response that nobody has measured, besides its own.
+
+    The robot follows the field later than the first one, by an unknown time of the order of the first one's delay:
+    while its mean own motion changes, that time is a velocity. And its speed is not in proportion to the frequency.
+    """
+    dt = seconds(now.stamp_ns - past.stamp_ns)
+    if not past.rolled_um_s.size or dt <= 0.0:
+        return made
+    late_um_s = robot.delay_s * math.hypot(*(now.rolled_um_s - past.rolled_um_s)) / dt
+    std_um_s = made.std_um_s.copy()
+    std_um_s[-1] = math.hypot(std_um_s[-1], late_um_s, _UNEVEN * math.hypot(*now.rolled_um_s))
+    return replace(made, std_um_s=std_um_s)
+
+
 def _command_of(demand: Demand | None, estimate: Estimate, robot: Robot) -> NDArray[np.float64]:
     """Velocity (2,) through the fluid that the last command gives another robot, um/s."""
     if demand is None:
@@ -102,6 +154,12 @@ def _wall(
     middle_um, slope = clearance_and_slope(clearance_um, estimate.position_um / um_per_px)
     size = math.hypot(*slope)
     return middle_um - radius_um, slope / size if size > 0.0 else np.zeros(2)
+
+
+def expected_unmoved(track: Track, robot: Robot, stamp_ns: int) -> Expected:
+    """The place where a robot of which only tracks are known is expected: where it was, and as far as it swims."""
+    far_um = robot.max_speed_um_s * max(seconds(stamp_ns - track.stamp_ns), 0.0)
+    return Expected(track.position_um, min(math.hypot(far_um, _STD_RADII * robot.radius_um), _FARTHEST_UM))
 
 
 def expected_robots(last: Tick, count: int, applied: Applied, stamp_ns: int, robot: Robot) -> list[Expected]:
@@ -127,10 +185,33 @@ def expected_robots(last: Tick, count: int, applied: Applied, stamp_ns: int, rob
     return found
 
 
+def as_stated(estimate: Estimate, robot: Robot) -> Estimate:
+    """An estimate with a response of its own, as that of a robot of the stated um per revolution g0.
+
+    With the estimated one, g, and the mean turns u per second, the flow becomes v + (g - g0) u. The sum of flow and own
+    motion stays as it is: that is what images tell, whatever the response. The covariance is that of these unknowns.
+    """
+    if estimate.um_per_rev is None or not estimate.rolled_um_s.size:
+        return estimate
+    turns = estimate.rolled_um_s / estimate.um_per_rev
+    jacobian = np.eye(len(estimate.covariance))
+    jacobian[2:4, -1] = turns
+    return replace(
+        estimate,
+        flow_um_s=estimate.flow_um_s + (estimate.um_per_rev - robot.um_per_rev) * turns,
+        covariance=(jacobian @ estimate.covariance @ jacobian.T)[:-1, :-1],
+        um_per_rev=None,
+        rolled_um_s=robot.um_per_rev * turns,
+    )
+
+
 def observe_others(
     observer: Observer, last: Tick, tracks: Sequence[Track], applied: Applied, robot: Robot, flow: FlowField | None
 ) -> list[Estimate]:
-    """The estimates of the other robots, each by an observer of its own that finds its um per revolution, too."""
+    """The estimates of the other robots, each by an observer of its own that finds its um per revolution, too.
+
+    Without a `flow` by one that uses no map: what that says of the flow is a measurement.
+    """
     each = replace(observer, kalman=replace(observer.kalman, estimate_gain=True))
     return [
         each.estimate(estimate_of(last, number), track, applied, robot, flow)

@@ -27,8 +27,11 @@ from flowrec.core import (
     Floats,
     FlowField,
     Frame,
+    Message,
     Observations,
     Phase,
+    PumpShare,
+    RobotWalls,
     Shift,
     Source,
     Tick,
@@ -55,6 +58,7 @@ from flowrec.stages.inputs import FROM_IMAGE, Inputs, with_inputs
 from flowrec.stages.other_robots import (
     OtherRobots,
     expected_robots,
+    expected_unmoved,
     messages_of_others,
     observe_others,
     tracks_of_others,
@@ -199,6 +203,7 @@ def look(p: Pipeline, last: Sight, frame: Frame, expected: Sequence[Expected] = 
     others: list[Track] = []
     if p.tracker.count > 1:
         seen = [] if previous is None else [previous, *last.others]
+        expected = expected or [expected_unmoved(track, p.robot, frame.stamp_ns) for track in seen]
         (first, *others), appearance = p.tracker.follow_all(
             seen, expected, last.appearance, frame, p.chip, p.calibration, p.robot, off_px, np.array(p.mission.start)
         )
@@ -263,6 +268,28 @@ def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track, rolled: Applied) ->
     if axes is not None and axes.verdict:
         return axes, None
     return axes, steady_velocity(axes, map_um_s) + (np.zeros(2) if waits else leg_velocity(axes))
+
+
+def _follow_others(
+    p: Pipeline,
+    last: Tick,
+    tracks: Sequence[Track],
+    rolled: Applied,
+    flow: FlowField | None,
+    pump: PumpShare | None,
+) -> tuple[RobotWalls, dict[str, Message]]:
+    """The distances of the robots other than the first one from walls, and all messages of them, by path."""
+    if p.others.observe_flow and p.sampler.without_map:
+        flow = None
+    estimates = observe_others(p.observer, last, tracks, rolled, p.robot, flow)
+    radii_um = [each.radius_px * p.calibration.um_per_px for each in tracks]
+    walls = p.others.watch(last, tracks, estimates, p.robot, radii_um, p.clearance_um, p.chip.um_per_px)
+
+    def at_nominal(before: Observations | None, now: Observations | None) -> Observations | None:
+        return now if pump is None else p.pump.at_nominal(before, now, pump)
+
+    seen = p.others.collect(p.sampler, last, estimates, walls, p.robot, at_nominal)
+    return walls, messages_of_others(tracks, estimates, walls) | seen
 
 
 def _no_lap(_stage: str) -> None:
@@ -330,10 +357,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         tick = replace(tick, extra=tick.extra.with_messages({PUMP: pump}))
     walls = None
     if sight.others:
-        others = observe_others(p.observer, last, sight.others, rolled, p.robot, seen)
-        radii_um = [each.radius_px * p.calibration.um_per_px for each in sight.others]
-        walls = p.others.watch(last, sight.others, others, p.robot, radii_um, p.clearance_um, p.chip.um_per_px)
-        told = messages_of_others(sight.others, others, walls)
+        walls, told = _follow_others(p, last, sight.others, rolled, seen, pump)
         tick = replace(tick, extra=tick.extra.with_messages(told))
     tracer_flow = None
     if p.tracker.tracers:

@@ -1,6 +1,7 @@
 """Topics of robots beside the first one: those of a table of fields of `Tick`, once for each robot.
 
-The first robot, number 0, has the fields themselves; the paths of number k have /robot/k where those have /robot.
+The first robot, number 0, has the fields themselves; the paths of number k have /robot/k where those have /robot, and
+/robot/k/observations for /flow/observations.
 """
 
 from __future__ import annotations
@@ -10,13 +11,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from flowrec.core import BY_FIELD, WALLS, Estimate, RobotWalls, Source, Tick, Topic, Track
+from flowrec.core import BY_FIELD, WALLS, Estimate, Observations, RobotWalls, Source, Tick, Topic, Track
 from flowrec.stages.rig_settings import SIMULATED
 
 _NUMBERED = re.compile(r"(?:/truth)?/robot/(\d+)(?:/|$)")
 _OF_EACH = ("track", "estimate")  # fields of Tick that each robot has
 _WALLS_TOPIC = Topic(WALLS, Source.STAGE, 1e-6, type=RobotWalls)
 _TRACK, _ESTIMATE = (BY_FIELD[name].path for name in _OF_EACH)
+_OBSERVATIONS = replace(BY_FIELD["observations"], path="/robot/observations")
 
 
 def robot_topic(path: str, number: int) -> str:
@@ -28,6 +30,8 @@ def robot_topics(config: Any) -> Iterator[Topic]:
     """The topics of the other robots of a run."""
     for number in range(1, config.tracker.count):
         yield from (_of(BY_FIELD[name], number) for name in _OF_EACH)
+        if config.others.observe_flow:
+            yield _of(_OBSERVATIONS, number)
     if config.tracker.count > 1:
         yield _WALLS_TOPIC
     if config.rig == SIMULATED:
@@ -48,6 +52,17 @@ def estimate_of(tick: Tick, number: int) -> Estimate | None:
     """The latest estimate of a robot."""
     message = tick.estimate if number == 0 else tick.extra.get(robot_topic(_ESTIMATE, number))
     return message if isinstance(message, Estimate) else None
+
+
+def observations_of_others(tick: Tick) -> dict[int, Observations]:
+    """The latest flow observations of the robots other than the first one, by number."""
+    found = {robot_number(path): message for path, message in tick.extra.items() if path.endswith("/observations")}
+    return {number: each for number, each in found.items() if number and isinstance(each, Observations)}
+
+
+def observations_topic(number: int) -> str:
+    """The path of the flow observations of a robot other than the first one."""
+    return robot_topic(_OBSERVATIONS.path, number)
 
 
 def robot_number(path: str) -> int:

@@ -9,21 +9,27 @@ import numpy as np
 
 from flowrec.core import (
     FLOW_FIELDS,
+    WALLS,
     Demand,
     Figures,
     FlowField,
     Mission,
+    Observations,
     Outcome,
     Phase,
+    RobotWalls,
     Route,
     Tick,
     Timing,
+    Track,
+    Truth,
     finite,
     seconds,
 )
 from flowrec.physics import Chip, Robot, relative_rmse
 from flowrec.stages.planning.planner import Planner
 from flowrec.stages.planning.survey_ways import METHOD as SURVEY_ROUTE
+from flowrec.stages.robot_topics import observations_topic, track_of
 
 CHAIN = ("arrived", "tracked", "commanded", "on the wire", "field")  # stages of the latency, after the exposure
 
@@ -35,6 +41,56 @@ def chain_ms(timing: Timing) -> tuple[float, ...]:
     tracked = arrived + waited + timing.track_ms
     wire = tracked + timing.observe_ms + timing.control_ms
     return arrived, tracked, wire - applied, wire, wire + field
+
+
+class RobotStatistics:
+    """Figures of a robot other than the first one, from all ticks."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self._images = self._seen = self._alarms = self._observations = 0
+        self._was_near = False
+        self._nearest_um = math.inf
+        self._true = ""  # path of the truth of this robot; '': not known
+        self._contacts: int | None = None  # None: the truth is not known
+
+    def write(self, tick: Tick, track: Track) -> None:
+        """Take one tick, and the track of this robot in it."""
+        if track.stamp_ns == tick.stamp_ns:
+            self._images += 1
+            self._seen += track.seen
+        walls = tick.extra.get(WALLS)
+        if isinstance(walls, RobotWalls) and self._number <= len(walls.near):
+            near = bool(walls.near[self._number - 1])
+            self._alarms += near and not self._was_near
+            self._was_near = near
+            if track.seen:
+                self._nearest_um = max(float(np.fmin(self._nearest_um, walls.wall_um[self._number - 1])), 0.0)
+        if track.seen and not self._true:  # numbers of true robots are not those of the tracks
+            truths = {path: each for path, each in tick.extra.items() if isinstance(each, Truth)}
+            off_um = {path: math.dist(each.position_um, track.position_um) for path, each in truths.items()}
+            self._true = min(off_um, key=lambda path: off_um[path], default="")
+        truth = tick.extra.get(self._true)
+        if isinstance(truth, Truth):
+            self._contacts = truth.contacts
+        observations = tick.extra.get(observations_topic(self._number))
+        if isinstance(observations, Observations):
+            self._observations = len(observations.std_um_s)
+
+    @property
+    def text(self) -> str:
+        """In words: share of the images in which it was tracked, alarms, walls, observations."""
+        words = [f"tracked in {self._seen / max(self._images, 1):.0%} of {self._images} images"]
+        if math.isfinite(self._nearest_um):
+            words.append(f"at least {self._nearest_um:.0f} um from walls")
+        counts = {"alarm near walls": self._alarms, "wall contact": self._contacts}
+        if self._observations:
+            counts["flow observation"] = self._observations
+        for name, count in counts.items():
+            first, _, rest = name.partition(" near")
+            if count is not None:
+                words.append(f"{count} {first}{'' if count == 1 else 's'}{_ + rest}")
+        return ", ".join(words)
 
 
 class RunStatistics:
@@ -55,6 +111,7 @@ class RunStatistics:
         self._square_um2 = 0.0
         self._count = 0
         self._last: Demand | None = None
+        self._others: dict[int, RobotStatistics] = {}
 
     def write(self, tick: Tick) -> None:
         """Take one tick."""
@@ -63,6 +120,10 @@ class RunStatistics:
             self.contacts = tick.truth.contacts
         if tick.timing is not None and tick.timing.arrival_ms is not None:
             self._chain_ms.append(chain_ms(tick.timing))
+        number = 1
+        while (track := track_of(tick, number)) is not None:
+            self._others.setdefault(number, RobotStatistics(number)).write(tick, track)
+            number += 1
         demand = tick.demand
         if tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
             return
@@ -74,6 +135,11 @@ class RunStatistics:
         if math.isfinite(demand.error_um):
             self._square_um2 += demand.error_um**2
             self._count += 1
+
+    @property
+    def others(self) -> Figures:
+        """A line of text for each robot other than the first one."""
+        return {f"robot_{number}": each.text for number, each in self._others.items()}
 
     @property
     def latency(self) -> str | None:

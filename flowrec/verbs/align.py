@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,13 +77,13 @@ def asked_import(
     return asked
 
 
-def fit_import(asked: Config, folder: Path, robot: str = "", *, align: bool = True) -> Looked:
+def fit_import(asked: Config, folder: Path, robots: Sequence[str] = (), *, align: bool = True) -> Looked:
     """Look through the movie once: which body is the robot, and how the clock of the log lies to that of the movie.
 
     Parameters and errors are those of `import_movie`; a picture of the candidates goes into `folder`.
     """
     fits = align and bool(asked.movie.coils) and not on_one_clock(asked)
-    looked = first_pass(asked, overlapping(asked) if fits else asked, robot, folder)
+    looked = first_pass(asked, overlapping(asked) if fits else asked, robots, folder)
     return align_log(looked) if fits else looked._replace(doubts=refuse_turned(looked))
 
 

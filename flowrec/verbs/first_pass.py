@@ -52,6 +52,7 @@ from flowrec.stages import (
 from flowrec.verbs.preparation import Prepared, prepare
 
 _SHAKES_PX = 0.1  # root mean square from which on it is told; half a pixel is what a track is off at most
+_ON_IT_RADII = 1.5  # between a named place and the disc that is found for it
 _PX = "px"
 _SURROUNDINGS_RADII = 6.0  # of the robot as stated: half the side of the window in which its size is measured
 _OTHER_SIZE = 2.0  # factor from which on a size is another one
@@ -106,14 +107,15 @@ class Looked(NamedTuple):
     doubts: Sequence[str] = ()
 
 
-def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Looked:
+def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: Path) -> Looked:
     """Look through the movie once; the robot is tracked if there is a log to compare with.
 
     Parameters
     ----------
     looked_at : the same configuration with the log where it overlaps the movie.
-    robot : which body is the robot: a number of the picture, "X,Ypx" in pixels of the first image, or "X,Y" in um on
-        the chip; '': the only one that qualifies, or the one of tracker.click_px or box_px.
+    robots : which bodies are the robots, the mission's one first: of each a number of the picture, "X,Ypx" in pixels
+        of the first image, or "X,Y" in um on the chip; none: the only one that qualifies, or the one of
+        tracker.click_px or box_px, or the tracker.robots most similar discs.
     folder : for the picture of the candidates.
 
     Raises
@@ -121,18 +123,24 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
     UsageError : several bodies qualify, or the given one is not there.
     FlowrecError : as `import_movie`.
     """
-    marked = asked.tracker.click_px is not None or asked.tracker.box_px is not None
+    named = [robot for robot in robots if robot]
+    robot = named[0] if named else ""
+    asks = asked.tracker
+    marked = asks.click_px is not None or asks.box_px is not None or bool(asks.robots_px)
     if robot and marked:
-        raise UsageError(f"--robot {robot}: tracker.click_px or box_px is set too; give one of them")
+        raise UsageError(f"--robot {robot}: tracker.click_px, box_px or robots_px is set too; give one of them")
     prepared = prepare(looked_at, aloud=False)  # the import says it, of the settings that are used
     p, movie = prepared.pipeline, looked_at.movie
-    place_px = _place_of(robot, asked, p)
-    if place_px is not None:
+    several = len(named) > 1 or asks.count > 1
+    place_px = None if several else _place_of(robot, asked, p)
+    if several:
+        asked = _with_robots(asked, p, movie, prepared, named) if named else asked
+    elif place_px is not None:
         asked = replace(asked, tracker=replace(asked.tracker, click_px=place_px))
     elif not marked and (seen := _first_seen(p, movie, prepared)) is not None:
         asked = _with_chosen_body(asked, p, *seen, robot, folder)
-    click = asked.tracker
-    p = replace(p, tracker=replace(p.tracker, click_px=click.click_px, click_frame=click.click_frame))
+    chosen = {name: getattr(asked.tracker, name) for name in ("click_px", "click_frame", "robots", "robots_px")}
+    p = replace(p, tracker=replace(p.tracker, **chosen))
     if place_px is not None:
         _refuse_empty(robot, p, movie, prepared)
     shifts_px, tracks = _look_through(p, movie, prepared)
@@ -144,6 +152,37 @@ def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Lo
             by_um = p.calibration.to_um(first_px) - p.calibration.to_um(asked.stabilise.first_px)
             tracks = tracks._replace(positions_um=tracks.positions_um + by_um)
     return Looked(asked, facts, prepared, tracks)
+
+
+def _with_robots(asked: Config, p: Pipeline, movie: MovieSettings, prepared: Prepared, robots: Sequence[str]) -> Config:
+    """The configuration with a point on each of several robots in the first image; UsageError where there is none."""
+    alone = replace(p, tracker=replace(p.tracker, robots=1, robots_px=()))
+    with MovieSource(movie, prepared.config.coils) as source:
+        image = next(iter(_within(source, prepared)))
+    candidates, _ = _candidates(p, image, look(alone, Sight(), image))
+    places_px = [_place_of(each, asked, p) or _place_of_number(each, candidates, image, asked) for each in robots]
+    count = max(asked.tracker.robots, len(places_px))
+    found = replace(p, tracker=replace(p.tracker, robots=count, robots_px=tuple(places_px)))
+    sight = look(found, Sight(), image)
+    radius_px = p.robot.radius_um / p.calibration.um_per_px
+    assert sight.track is not None
+    for robot, at_px, track in zip(robots, places_px, (sight.track, *sight.others), strict=False):
+        if not track.seen or math.dist(p.calibration.to_px(track.position_um), at_px) > _ON_IT_RADII * radius_px:
+            raise UsageError(
+                f"--robot {robot}: at ({at_px[0]:.0f}, {at_px[1]:.0f}) px of image {image.index} no disc of the "
+                "robot's size and darkness is found; give the middle of a robot"
+            )
+    return replace(asked, tracker=replace(asked.tracker, robots=count, robots_px=tuple(places_px)))
+
+
+def _place_of_number(robot: str, places_px: Floats, image: Frame, asked: Config) -> tuple[float, float]:
+    """The place of a number of the picture."""
+    number = int(robot)
+    if not 1 <= number <= len(places_px):
+        there = "is 1" if len(places_px) == 1 else f"are {len(places_px)}"
+        raise UsageError(f"--robot {robot}: there {there} to choose from in image {image.index} of {asked.movie.path}")
+    x, y = places_px[number - 1].round(2).tolist()
+    return x, y
 
 
 def _refuse_empty(robot: str, p: Pipeline, movie: MovieSettings, prepared: Prepared) -> None:
@@ -260,14 +299,10 @@ def _with_chosen_body(asked: Config, p: Pipeline, image: Frame, sight: Sight, ro
             warn(f"{name}: the robot in image {image.index} has {size}")
         return asked
     if robot:
-        number = int(robot)
-        if not 1 <= number <= len(places):
-            there = "is 1" if len(places) == 1 else f"are {len(places)}"
-            raise UsageError(f"--robot {robot}: there {there} to choose from in image {image.index} of {name}")
-        if size := _size_text(p, image.image, places[number - 1]):
-            warn(f"{name}: body {number} of image {image.index} has {size}")
-        x, y = places[number - 1].round(2).tolist()
-        return replace(asked, tracker=replace(asked.tracker, click_px=(x, y), click_frame=image.index))
+        at_px = _place_of_number(robot, places, image, asked)
+        if size := _size_text(p, image.image, np.array(at_px)):
+            warn(f"{name}: body {robot} of image {image.index} has {size}")
+        return replace(asked, tracker=replace(asked.tracker, click_px=at_px, click_frame=image.index))
     count = f"at least {len(places)}" if len(places) >= MOST - 4 else len(places)  # near the limit some are left out
     factor, told = _factor(image.image), what.format(count, image.index)
     if len(places) == 1:

@@ -1,6 +1,7 @@
 """`flowrec import`: a movie and a log of the coils become a session, as if the run had been recorded."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,9 +50,13 @@ def import_movie(
         typer.Option("--align/--no-align", help="Fit the clock of the log to the motion of the robot."),
     ] = True,
     robot: Annotated[
-        str | int,
-        typer.Option(metavar="WHICH", help="Which body is the robot: number of the picture, X,Ypx, or X,Y in um."),
-    ] = "",
+        list[str] | Sequence[str | int] | str | int,
+        typer.Option(
+            metavar="WHICH",
+            help="Which body is the robot: number of the picture, X,Ypx, or X,Y in um; several times: robots, the "
+            "mission's one first.",
+        ),
+    ] = (),
     sets: Sets = None,
     overwrite: Overwrite = False,
     control: Annotated["Unattended | None", ATTENDED] = None,
@@ -90,7 +95,8 @@ def import_movie(
     path = None if out is None else Path(out)
     if path is not None:  # before the whole movie is looked through
         Output(path, MCAP, (*inputs,), overwrite).check()
-    looked = fit_import(asked, path.parent if path is not None else Path(), str(robot), align=align)
+    robots = [str(each) for each in ([robot] if isinstance(robot, str | int) else robot)]
+    looked = fit_import(asked, path.parent if path is not None else Path(), robots, align=align)
     if not asked.movie.coils and not asked.movie.drifts:
         say(f"{movie}: without --coils LOG the robot is tracked, and the flow is not refined")
     return run_mission(looked.asked, path, overwrite=overwrite, control=control, inputs=inputs, looked=looked)

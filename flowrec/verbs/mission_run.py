@@ -304,6 +304,7 @@ class _Mission:
         # Without navigation, and for a control law that descends the time to go, there is no reference.
         if not (config.mission.observes or config.control.needs):
             facts["tracking_error_um"] = self._statistics.tracking_error_um
+        facts |= self._statistics.others
         if (latency := self._statistics.latency) is not None:
             facts["latency"] = latency
         if self._control.note:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +30,7 @@ from flowrec.core import (
     warn,
     with_micro,
 )
-from flowrec.run import CommandDifference, ReplayPair, RunControl, RunReport, before_after, work
+from flowrec.run import CommandDifference, ReplayPair, RunControl, RunReport, before_after, messages_read, work
 from flowrec.stages import Pipeline, ResolvedConfig
 from flowrec.store import Session, digest_faults
 from flowrec.verbs.comparison import Comparison
@@ -90,7 +89,7 @@ class WorkerCheck:
             return
         mission = order.mission
         answer = ANSWERED_BY[WorkOrder(mission.wanted)]
-        if _knows_more(order, mission, WORKER_FIELDS[answer].reads):
+        if _knows_more(order, mission, answer):
             self._unknown.add(mission.request)
             path = BY_FIELD[answer].path
             self.results.lines.append(f"{path}: ordered in the part before, taken as recorded")
@@ -128,9 +127,9 @@ class WorkerCheck:
         self._last = tick
 
 
-def _knows_more(order: Tick, mission: Mission, reads: Iterable[str]) -> bool:
+def _knows_more(order: Tick, mission: Mission, answer: str) -> bool:
     """True if a part of a run begins after an order, and its keyframe holds later messages that the work reads."""
-    read = [getattr(order, name) for name in reads]
+    read: list[Any] = [*messages_read(order, answer).values()]
     return any(message is not None and message.stamp_ns > mission.requested_ns for message in read)
 
 

@@ -23,6 +23,7 @@ from flowrec.core import (
     doubts_of,
     doubts_text,
     goal_text,
+    is_of_robot,
     name_of,
     progress,
     say,
@@ -259,7 +260,8 @@ def _key_figures(data: ReportData) -> ReportTable:
         if error is not None:  # of a run that was cut off, its last tick instead of its figures
             figures.setdefault(f"{name}_flow_error", error)
     rows = [
-        (name_of(key), with_micro(text_of_figure(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()
+        (name_of(key), with_micro(text_of_figure(key, value)), MEANINGS.get("robot" if is_of_robot(key) else key, ""))
+        for key, value in figures.items()
     ]
     for name, field in _maps(data).items():
         if field.error_share is not None:

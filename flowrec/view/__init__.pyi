@@ -1,7 +1,7 @@
 from . import viewer as viewer
 from .bare_blueprint import bare_blueprint as bare_blueprint
 from .bare_plots import plot_of as plot_of, stream_plots as stream_plots
-from .colours import ColourScale as ColourScale, OF_PHASE as OF_PHASE, round_below as round_below
+from .colours import ColourScale as ColourScale, OF_PHASE as OF_PHASE, of_robot as of_robot, round_below as round_below
 from .drawing import WindowCompleter as WindowCompleter, encode_jpeg as encode_jpeg
 from .entities import PAIR as PAIR, REPLAY as REPLAY
 from .feed import Batch as Batch, Feed as Feed, FeedSink as FeedSink, read_feed as read_feed

@@ -19,6 +19,7 @@ from flowrec.core import (
     doubts_text,
     flow_text,
     goal_text,
+    robot_lines,
     seconds,
     text_for_picture,
     verdict_lines,
@@ -90,7 +91,8 @@ def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.
     rows = comparison_for_people(row for row in rows_of_run(last, figures) if row[0] not in said)
     about = "; ".join([f"session {title}", *(f"{name} {value}" for name, value, _ in rows)])
     ended, *told = verdict_lines({"outcome": "its end is not known", **figures}, last.refined)
-    return _document(_sentences(filter(None, [ended, about, *told, registration_remark(last.refined)])))
+    others = robot_lines(figures)
+    return _document(_sentences(filter(None, [ended, about, *told, *others, registration_remark(last.refined)])))
 
 
 def doubts_remark(figures: Mapping[str, Value], whose: str = "") -> str:
@@ -140,6 +142,7 @@ class LiveSummary:
         """The panel at the last tick."""
         last, seen = self._last, self._statistics
         figures = figures_of(self._scene.chip, last, seen.true_field, seen.contacts, seen.navigating_ns)
+        figures |= seen.others
         mission, timing = last.mission, last.timing
         if mission is not None and mission.finished:
             figures |= {"outcome": mission.outcome, "note": mission.note}

@@ -28,10 +28,11 @@ from flowrec.console.console import CommandReply, RunEnded
 from flowrec.console.page_state import PageState
 from flowrec.core.enums import Action
 from flowrec.core.errors import UsageError
-from flowrec.core.messages import Event, FlowField, OperatorEvent
-from flowrec.core.topics import Tick
+from flowrec.core.messages import WALLS, Estimate, Event, FlowField, OperatorEvent, RobotWalls, Track
+from flowrec.core.topics import Extra, Tick
 from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import COMMANDS, obey
+from flowrec.stages.robot_topics import messages_of
 from flowrec.view.feed import Batch
 from flowrec.view.live import LiveView
 from flowrec.view.scene import Scene
@@ -378,6 +379,25 @@ def test_the_page_is_told_accepted_only_by_the_run_and_otherwise_why_not(scene: 
         assert "too many" in refusal(command="mark")
         assert refusal(command="stop") == ""
         assert "the run ends: stopped by the operator" in refusal(command="goal", x_px=10.0, y_px=20.0)
+
+
+def test_other_robots_are_shown_with_their_numbers_where_the_image_shows_them(scene: Scene) -> None:
+    state = PageState(scene)
+    assert state.state()["others"] == []
+    places = {1: np.array([400.0, 500.0]), 2: np.array([700.0, 480.0])}
+    extra: dict[str, Any] = {WALLS: RobotWalls(5, np.array([3.0, 40.0]), np.array([1.0, 0.0]), np.zeros(2))}
+    for number, at in places.items():
+        nothing = Track(5, number == 1, at, 0.9, 0, 8.0, np.zeros(4))
+        extra |= messages_of(number, nothing, Estimate(5, at, np.zeros(2), np.eye(4), 2.0, at, seen=number == 1))
+    state.take(Batch(1, [{"extra": Extra(extra)}], {}))
+    first, second = state.state()["others"]
+    assert [(each["number"], each["seen"], each["near"]) for each in (first, second)] == [
+        (1, True, True),
+        (2, False, False),
+    ]
+    for each, at in zip((first, second), places.values(), strict=True):
+        np.testing.assert_allclose(state.chip_um(*each["at"]), at, atol=0.08 * scene.calibration.um_per_px)
+    assert first["colour"] != second["colour"]
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 90.0, 33.0])

@@ -26,6 +26,7 @@ def ordered(survey, planner, limit_hz=None, speed_limit_um_s=None):
     )
     tick = SimpleNamespace(
         estimate=SimpleNamespace(covariance=np.eye(4)),
+        extra={},
         health=SimpleNamespace(limit_hz=limit_hz),
         **{
             "field": 1,
@@ -82,6 +83,7 @@ def test_a_pause_takes_nothing_from_the_time_of_a_survey():
     order = SimpleNamespace(
         stamp_ns=75_000_000_000,
         estimate=SimpleNamespace(covariance=np.eye(4)),
+        extra={},
         health=SimpleNamespace(limit_hz=None),
         route=SimpleNamespace(arrival_s=np.array([0.0, 7.0])),
         demand=SimpleNamespace(progress_s=4.0),

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from flowrec.core.errors import FlowrecError
-from flowrec.core.messages import FlowField, Mission
-from flowrec.core.topics import Tick
+from flowrec.core.messages import PUMP, FlowField, Mission, PumpShare
+from flowrec.core.topics import Extra, Tick
 from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import work
 from flowrec.stages.config import load_config
@@ -121,7 +121,7 @@ def answer(process: ProcessWorker) -> Any:
             time.sleep(0.02)
     except Exception as error:  # noqa: BLE001
         return error
-    return results.get("assumed")
+    return next(iter(results.values()), None)
 
 
 @pytest.mark.slow("starts a worker")
@@ -148,6 +148,18 @@ def test_orders_are_answered_as_at_home_and_a_process_that_is_killed_is_told_of(
     error = answer(process)
     assert isinstance(error, FlowrecError)
     assert "ended unasked (killed by SIGKILL)" in str(error)
+
+
+@pytest.mark.slow("starts a worker, and solves a flow")
+def test_a_route_is_planned_with_the_mean_flow_of_the_pump_in_the_process_as_at_home(pipeline, order, working) -> None:
+    places = np.array([300.0, 2700.0]), np.array([6000.0, 2700.0])
+    mission = replace(order.mission, wanted="route", phase="plan", start_um=places[0], goal_um=places[1])
+    still = replace(order, assumed=work(pipeline, order), mission=mission)
+    pumped = replace(still, extra=Extra({PUMP: PumpShare(0, 1.0, 0.4, 1.0, 0)}))
+    process = working()
+    process.submit(pumped)
+    assert (planned := answer(process)).same_as(work(pipeline, pumped))
+    assert planned.reachable and not planned.same_as(work(pipeline, still))
 
 
 def test_a_process_that_is_stopped_while_the_mission_waits_for_it_is_told_of(order, working) -> None:

@@ -9,15 +9,30 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flowrec.core import WALLS, Applied, Demand, Estimate, RobotWalls, Source, Tick, Topic, Track, Truth
+from flowrec.core import (
+    PUMP,
+    WALLS,
+    Applied,
+    Demand,
+    Estimate,
+    Observations,
+    PumpShare,
+    RobotWalls,
+    Source,
+    Tick,
+    Topic,
+    Track,
+    Truth,
+)
 from flowrec.core.topics import Extra
 from flowrec.physics import Robot, clearance_um, load_chip
 from flowrec.rigs import SimulatedRig
-from flowrec.run import LockstepWorker, run
-from flowrec.stages import assemble, load_config, resolve, robot_topic
+from flowrec.run import LockstepWorker, messages_read, run
+from flowrec.run.route_orders import observations_of
+from flowrec.stages import assemble, config_from_toml, load_config, resolve, robot_topic, to_toml
 from flowrec.stages.control.events import event_of
-from flowrec.stages.estimation import Observer
-from flowrec.stages.other_robots import OtherRobots, expected_robots, observe_others
+from flowrec.stages.estimation import Observer, Sampler
+from flowrec.stages.other_robots import OtherRobots, as_stated, expected_robots, observe_others
 from flowrec.stages.pipeline import step
 from flowrec.stages.robot_topics import messages_of, robot_number, robot_topics
 from tests.short_missions import SMALL
@@ -120,8 +135,11 @@ def test_topics_are_those_of_the_first_robot_with_a_number() -> None:
     topics = {topic.path: topic for topic in robot_topics(config)}
     assert set(topics) == {
         *("/robot/1/track", "/robot/1/estimate", "/robot/2/track", "/robot/2/estimate"),
+        *("/robot/1/observations", "/robot/2/observations"),
         *("/robots/walls", "/truth/robot/1", "/truth/robot/2"),
     }
+    unasked = {topic.path for topic in robot_topics(load_config(None, [*SEVERAL, "others.observe_flow=false"]))}
+    assert unasked == {path for path in topics if not path.endswith("/observations")}
     assert topics["/robot/2/track"].type is Track and topics["/truth/robot/1"].source is Source.SIMULATOR
     assert [robot_number(path) for path in ("/robot/12/track", "/robot/track", "/truth/robot/3", "/robots/walls")] == [
         *(12, 0, 3, 0)
@@ -166,3 +184,108 @@ def test_a_limit_slows_the_command_while_a_robot_is_near_a_wall() -> None:
         assert all(speed <= 60.0 + 1e-6 for holds, speed in told if holds is not None)
         assert (limit is None) or any(holds is not None and speed > 50.0 for holds, speed in told)
     assert fastest[None] > 200.0
+
+
+def test_an_estimate_as_of_the_stated_response_has_the_same_velocity_over_ground() -> None:
+    """By draws from the covariance of the filter: the flow is what is left of the velocity, whatever the response."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(8, 8)) * np.array([1.0, 1.0, 5.0, 5.0, 0.1, 0.1, 0.1, 2.0])[:, None]
+    turns = np.array([6.0, -3.0])
+    own = replace(
+        estimate(MIDDLE_UM, 31.0, (80.0, 20.0)),
+        covariance=root @ root.T,
+        rolled_um_s=31.0 * turns,
+        slopes_per_s=np.zeros(3),
+    )
+    stated = as_stated(own, ROBOT)
+    np.testing.assert_allclose(stated.flow_um_s + stated.rolled_um_s, own.flow_um_s + own.rolled_um_s)
+    np.testing.assert_allclose(stated.rolled_um_s, 25.0 * turns)
+    drawn = rng.normal(size=(200_000, 8)) @ root.T
+    flow = drawn[:, 2:4] + drawn[:, 7:] * turns
+    np.testing.assert_allclose(stated.covariance[2:4, 2:4], np.cov(flow.T), rtol=0.03)
+    assert stated.um_per_rev is None and len(stated.covariance) == 7
+    bare = estimate(MIDDLE_UM, 31.0)
+    assert as_stated(bare, ROBOT) is bare, "before anything rolled"
+
+
+@pytest.mark.parametrize(
+    ("near", "observed"), [((0.0, 0.0), True), ((1.0, 0.0), False), ((0.0, 1.0), False), ((0.0, None), False)]
+)
+def test_a_robot_that_touches_a_wall_or_is_out_of_view_observes_no_flow(near, observed) -> None:
+    told = [
+        RobotWalls(k, np.array([math.nan if each is None else 30.0]), np.array([each or 0.0]), np.zeros(1))
+        for k, each in enumerate(near)
+    ]
+    before, now = (
+        replace(estimate(MIDDLE_UM, 25.0, (50.0, 0.0), stamp_ns), covariance=np.eye(5), rolled_um_s=np.ones(2))
+        for stamp_ns in (0, 40_000_000)
+    )
+    last = Tick(extra=Extra({WALLS: told[0], **messages_of(1, track(MIDDLE_UM), before)}))
+    made = OtherRobots().collect(Sampler(), last, [now], told[1], ROBOT, lambda _, found: found)
+    assert bool(made) is observed
+    assert not OtherRobots(observe_flow=False).collect(Sampler(), last, [now], told[1], ROBOT, lambda _, found: found)
+
+
+def test_observations_of_robots_are_joined_by_number_and_tracers_follow() -> None:
+    def seen(count: int, at: float, rolled: bool = True) -> Observations:
+        values = np.full((count, 2), at)
+        return Observations(1, values, values, np.ones(count), values if rolled else None, np.full(count, at), 50.0)
+
+    first, bead = seen(3, 0.0), replace(seen(2, 9.0), tracer=np.array([7.0, 8.0]), entered=np.zeros(2))
+    joined = first.with_robots({2: seen(2, 2.0), 1: seen(1, 1.0), 3: seen(4, 3.0, rolled=False)}).with_tracers(bead)
+    assert joined.tracer.tolist() == [-1.0, -1.0, -1.0, -2.0, -3.0, -3.0, 7.0, 8.0]
+    assert joined.time_s.tolist() == [0.0, 0.0, 0.0, 1.0, 2.0, 2.0, 9.0, 9.0] and joined.radius_um == 50.0
+    assert first.with_robots({}) is first and first.with_robots({1: seen(0, 1.0)}) is first
+    none = seen(0, 0.0).with_robots({2: seen(2, 2.0)})
+    assert none.tracer.tolist() == [-3.0, -3.0]
+
+
+def test_a_session_that_lacks_the_setting_observes_with_the_first_robot_alone() -> None:
+    config = load_config(None, SEVERAL)
+    chip = load_chip(config.chip)
+    text = to_toml(resolve(config, chip))
+    assert "observe_flow = true" in text
+    assert config_from_toml(text, "a").others.observe_flow
+    assert not config_from_toml(text.replace("observe_flow = true\n", ""), "a").others.observe_flow
+
+
+def test_an_order_has_the_observations_of_all_robots_and_the_process_that_does_it_gets_them() -> None:
+    config = resolve(load_config(None, SEVERAL), load_chip(load_config(None, SEVERAL).chip))
+    pipeline = assemble(config, load_chip(config.chip))
+    ticks: list[Tick] = []
+    run(
+        pipeline,
+        SimulatedRig.of(pipeline, config, duration_s=2.0),
+        LockstepWorker(pipeline, 0.3),
+        [],
+        on_tick=ticks.append,
+    )
+    last = ticks[-1]
+    others = {k: last.extra[robot_topic("/robot/observations", k)] for k in (1, 2)}
+    joined = observations_of(pipeline, last)
+    counts = [int((joined.tracer == -1.0 - k).sum()) for k in range(3)]
+    assert counts == [len(last.observations.std_um_s), *(len(each.std_um_s) for each in others.values())]
+    pump = PumpShare(1, 1.0, 1.0, 1.0, 0)
+    read = messages_read(replace(last, extra=last.extra.with_messages({PUMP: pump})), "refined")
+    assert read[PUMP] is pump and all(read[robot_topic("/robot/observations", k)] is each for k, each in others.items())
+    assert "/robot/1/track" not in read and not messages_read(last, "assumed")
+
+
+def test_an_observation_is_less_certain_while_the_own_motion_of_a_robot_of_unknown_lag_changes() -> None:
+    told = RobotWalls(0, np.array([30.0]), np.zeros(1), np.zeros(1))
+    stds = {}
+    for change in (0.0, 10.0):
+        estimates = [
+            replace(
+                estimate(MIDDLE_UM, 25.0, (50.0, 0.0), stamp_ns),
+                covariance=np.eye(5),
+                rolled_um_s=np.array([100.0 + change * (stamp_ns > 0), 0.0]),
+            )
+            for stamp_ns in (0, 40_000_000)
+        ]
+        last = Tick(extra=Extra({WALLS: told, **messages_of(1, track(MIDDLE_UM), estimates[0])}))
+        (made,) = OtherRobots().collect(Sampler(), last, [estimates[1]], told, ROBOT, lambda _, found: found).values()
+        stds[change] = float(made.std_um_s[-1])
+    assert stds[0.0] == pytest.approx(math.hypot(7.0, 2.8), rel=0.05), "uneven rolling, and the sampler's own"
+    late_um_s = ROBOT.delay_s * 10.0 / 0.04
+    assert stds[10.0] == pytest.approx(math.hypot(stds[0.0], late_um_s), rel=0.05)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,19 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
-from flowrec.stages import robot_topic
+from flowrec.core.errors import UsageError
+from flowrec.stages import load_config, robot_topic
+from flowrec.stages.robot_topics import track_of
+from flowrec.verbs.align import asked_import, fit_import
 from flowrec.verbs.cli import app
 from flowrec.verbs.compare import compare
 from tests.rewritten import leaves_of, rewrite
 from tests.short_missions import SMALL
 
 SEVERAL = [*SMALL, "simulated.robots=3", "tracker.robots=3", "simulated.seed=4"]
+IMPORTED = ["mission.check_axes=false", "refine.assimilate.doubt_depth=false", "recording.own_process=false"]
 COMPUTED = [robot_topic(path, number) for path in ("/robot/track", "/robot/estimate") for number in (1, 2)]
+OBSERVED = [robot_topic("/robot/observations", number) for number in (1, 2)]
 
 
 def run(*words: object) -> tuple[int, str]:
@@ -51,6 +57,8 @@ def test_a_replay_computes_all_robots_again_also_from_the_middle(mission: Path, 
     assert status == 0 and found["same"] is not False
     for path in (*COMPUTED, "/robots/walls"):
         assert found["topics"][path]["identical"] > 30 and not found["topics"][path]["different"], path
+    for path in OBSERVED:
+        assert found["topics"][path]["identical"] and not found["topics"][path]["different"], path
     assert run("check", mission)[0] == 0
 
 
@@ -98,6 +106,7 @@ def test_the_first_robot_may_be_replayed_alone(mission: Path) -> None:
     assert status == 0, said
     session = flowrec.open(mission.with_name("one.mcap"))
     assert session.topics["/robot/track"] > 30 and "/robot/1/track" not in session.topics
+    assert not any(key.startswith("robot_") for key in session.outcome)
 
 
 def test_tables_have_one_for_each_robot_and_its_truth(mission: Path, tmp_path: Path) -> None:
@@ -110,4 +119,68 @@ def test_tables_have_one_for_each_robot_and_its_truth(mission: Path, tmp_path: P
         )
         assert track.num_rows == truth.num_rows > 30
         assert {"position_x_um", "seen"} <= set(track.column_names), track.column_names
+        observed = pyarrow.parquet.read_table(tmp_path / "tables" / f"observed_flow.robot.{number}.parquet")
+        last = flowrec.open(mission).last.extra[robot_topic("/robot/observations", number)]
+        assert observed["x_um"].to_pylist() == last.position_um[:, 0].tolist()
     assert np.isfinite(track["score"].to_numpy()).all()
+
+
+@pytest.fixture(scope="module")
+def movie(mission: Path) -> tuple[Path, Path, list[list[float]]]:
+    """The images of the mission, the log of its coils, and where its robots are in the first image, in px."""
+    file, tables = mission.with_name("movie.ome.tif"), mission.with_name("tables")
+    for target, kind in ((file, "tiff"), (tables, "csv")):
+        status, said = run("export", mission, target, "--format", kind)
+        assert status == 0, said
+    session = flowrec.open(mission)
+    first = next(iter(session.ticks()))
+    places = [track_of(first, number).position_um for number in range(3)]
+    return file, tables / "applied.csv", [session.calibration.to_px(place).tolist() for place in places]
+
+
+def test_robots_of_a_movie_are_named_by_their_places(
+    movie: tuple[Path, Path, list[list[float]]], mission: Path
+) -> None:
+    file, log, (first, second, third) = movie
+    out = mission.with_name("imported.mcap")
+    places = [f"{x:.0f},{y:.0f}px" for x, y in (first, third)]
+    flowrec.import_movie(file, out, sets=IMPORTED, coils=log, robot=places, align=False)
+    ticks = [tick for tick in flowrec.open(out).ticks() if tick.frame is not None]
+    was = {tick.stamp_ns: track_of(tick, 2).position_um for tick in flowrec.open(mission).ticks()}
+    off_um = [np.hypot(*(track_of(tick, 1).position_um - was[tick.stamp_ns])) for tick in ticks[:20]]
+    assert max(off_um) < 10.0, "the second one that was named is robot 2 of the mission"
+    assert track_of(ticks[0], 2) is None
+    x, y = second[0] + 60.0, second[1]
+    with pytest.raises(UsageError, match="no disc of the robot's size"):
+        flowrec.import_movie(
+            file, out, sets=IMPORTED, coils=log, robot=[places[0], f"{x},{y}px"], align=False, overwrite=True
+        )
+
+
+def test_robots_of_a_movie_are_named_by_numbers_of_its_picture(movie: tuple[Path, Path, list[list[float]]]) -> None:
+    file, log, places = movie
+    from_the_top = sorted(places, key=lambda place: place[1])
+    asked = asked_import(file, load_config(None, IMPORTED), coils=log)
+    for named in ((3, 1), (1, 2)):  # the two that stand out most, and others
+        found = fit_import(asked, file.parent, [*map(str, named)], align=False).asked.tracker
+        np.testing.assert_allclose(found.robots_px, [from_the_top[each - 1] for each in named], atol=1.0)
+    with pytest.raises(UsageError, match="--robot 7: there are 3 to choose from"):
+        fit_import(asked, file.parent, ["1", "7"], align=False)
+
+
+def test_a_line_for_each_other_robot_ends_a_run_and_stands_in_its_session(mission: Path) -> None:
+    outcome = flowrec.open(mission).outcome
+    ticks = list(flowrec.open(mission).ticks())
+    for number in (1, 2):
+        text = outcome[f"robot_{number}"]
+        assert f"tracked in 100% of {len(ticks)} images" in text
+        at_um = track_of(ticks[0], number).position_um
+        contacts = [
+            (math.dist(each.position_um, at_um), path)
+            for path, each in ticks[0].extra.items()
+            if path.startswith("/truth/robot/")
+        ]
+        truth = ticks[-1].extra[min(contacts)[1]]
+        assert f", {truth.contacts} wall contact" in text
+    status, said = run("info", mission)
+    assert status == 0 and "robot 1" in said and "tracked in" in said

@@ -204,8 +204,35 @@ function showState(state) {
   document.querySelector("[data-command=end]").disabled = !state.observing || ended;
   place(part("robot"), state.robot, ring());
   part("robot").classList.toggle("unseen", !state.seen);
+  showOthers(state.others);
   if (state.robot !== null) trail = [...trail.slice(1 - TRAIL), state.robot];
   part("trail").setAttribute("points", trail.join(" "));
+}
+
+function showOthers(others) {
+  const drawn = ["circle", "text"].map((name) => document.createElementNS("http://www.w3.org/2000/svg", name));
+  const group = part("others");
+  while (group.children.length > others.length) group.lastChild.remove();
+  while (group.children.length < others.length) {
+    const robot = document.createElementNS("http://www.w3.org/2000/svg", "g");
+    robot.append(...drawn.map((each) => each.cloneNode()));
+    group.append(robot);
+  }
+  others.forEach(({ number, at, colour, seen, near }, index) => {
+    const robot = group.children[index];
+    const [circle, words] = robot.children;
+    robot.classList.toggle("unseen", !seen);
+    robot.classList.toggle("near", near);
+    circle.style.stroke = seen ? colour : "";
+    place(circle, at, ring());
+    words.toggleAttribute("hidden", at === null);
+    words.textContent = number;
+    if (at !== null) {
+      words.setAttribute("x", at[0] + 1.3 * ring());
+      words.setAttribute("y", at[1] - 0.8 * ring());
+      words.setAttribute("font-size", 0.028 * step.width);
+    }
+  });
 }
 
 function showEvents(events) {

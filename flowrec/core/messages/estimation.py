@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -125,19 +127,34 @@ class Observations(Message):
     tracer: Annotated[
         Vector | None,
         Shape("n"),
-        "number of the tracer that was observed; -1: the robot; None: all are of the robot",
+        "number of the tracer that was observed; -1: the robot, -2: robot 1, -3: robot 2; None: all are of the robot",
     ] = None
     entered: Annotated[
         Vector | None, Shape("n"), "1 for a tracer that came in while it was watched, see Tracers; None: no tracers"
     ] = None
 
+    def with_robots(self, others: Mapping[int, Observations]) -> Observations:
+        """The observations of the first robot, then those of others by their numbers; itself if there are none.
+
+        Others are left out where it is not stated what they rolled: their response is not that of the first one.
+        """
+        known = [(number, one) for number, one in sorted(others.items()) if one.rolled_um_s is not None]
+        every = [(number, one) for number, one in ((0, self), *known) if len(one.std_um_s)]
+        if not every or every[-1][0] == 0:
+            return self
+        each = [
+            replace(one, tracer=np.full(len(one.std_um_s), -1.0 - number), entered=np.zeros(len(one.std_um_s)))
+            for number, one in every
+        ]
+        return replace(functools.reduce(Observations.followed_by, each), stamp_ns=self.stamp_ns)
+
     def with_tracers(self, tracers: Observations | None) -> Observations:
-        """The observations of the robot, then those of tracers, which roll nowhere; itself if there are none."""
+        """The observations of robots, then those of tracers, which roll nowhere; itself if there are none."""
         if tracers is None or not len(tracers.std_um_s):
             return self
-        none = np.full(len(self.std_um_s), -1.0)
-        own = replace(self, tracer=none, entered=np.zeros(len(none)))
-        if not len(none):
+        robots = np.full(len(self.std_um_s), -1.0) if self.tracer is None else self.tracer
+        own = replace(self, tracer=robots, entered=np.zeros(len(robots)))
+        if not len(robots):
             return replace(tracers, stamp_ns=self.stamp_ns)
         more = replace(tracers, rolled_um_s=np.zeros_like(tracers.flow_um_s))
         return replace(own.followed_by(more), stamp_ns=self.stamp_ns, radius_um=self.radius_um)

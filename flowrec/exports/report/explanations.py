@@ -41,6 +41,7 @@ MEANINGS: dict[str, str] = {
     "speed_limit_um_s": "set by the operator, of the robot through the fluid",
     "unmet_mt": "of coils.amplitude_mt, what the limits of current and voltage of the coils did not permit",
     "contacts": "counted by the simulation",
+    "robot": "a robot beside the mission's one; wall contacts are counted by the simulation",
     "assumed_method": "how the flow was computed before the run",
     "assumed_flow_error": "root mean square difference from the simulated true flow, relative to that flow",
     "refined_method": "how the flow was corrected in the run",

@@ -3,10 +3,11 @@
 With the measured flow y_i at x_i, the robot's own motion r_i as it is assumed, and the flow v:
 
     y_i = v(x_i) + dv/dx (offset - scale (x_i - c) - angle J (x_i - c)) + (scale + angle J) v + scale r_i
-          + (gain - hindrance (b_i - b)) r_i + heading J r_i + rolling(t_i) r_i
+          + (gain + gain_k - hindrance (b_i - b)) r_i + heading J r_i + rolling(t_i) r_i
           + sphere(v) + walls(x_i) + v p(t_i) + local(x_i) + noise
 
-J turns from +x to +y, c is the mean of the places. b_i is the drag of the side walls on a sphere of the robot's radius,
+gain_k is what another robot, number k, rolls farther per revolution than the first one; rolling is of each robot. J
+turns from +x to +y, c is the mean of the places. b_i is the drag of the side walls on a sphere of the robot's radius,
 relative to the largest one, and b its mean: the gain is that of the robot where it was observed, and hindrance what
 differs nearer to or farther from a wall. sphere(v) is how a sphere lags behind the flow, sphere_between_walls.py. Where
 the radius is not stated (older sessions), b_i = exp(-(d_i - d) / (d / 2)) falls with the distance d_i to the wall, d is
@@ -50,6 +51,8 @@ LOCAL = (1.0, 0.8)  # of the error of the grid that the model states
 WALL_BIAS = (0.5, 0.6)
 WALL_BIAS_NAME = "wall bias"
 GAIN = (0.08, 1.3)  # um per revolution is known to a few per cent where it was calibrated, else to 15 %
+# Of another robot, one value each: of a batch, of which one was calibrated, or of another kind.
+OTHERS_GAIN = (0.2, 1.0)
 HEADING = (0.01, 0.8)  # rad: coils and camera are aligned to half a degree
 CURVED = (0.12, 0.8)  # of the part of Faxen's law that a sphere as large as the least distance to a wall would show
 HINDRANCE = (0.05, 1.0)  # of the own motion, between the least distance to a wall and far from one
@@ -255,6 +258,9 @@ class Observed:
                 _effect("heading", HEADING, quarter_turn(own)[None]),
                 _effect("hindrance", self._hindrance_size(), -((self.near - self.near.mean())[:, None] * own)[None]),
             ]
+            others = np.unique(self.robot[self.robot > 0.0])
+            if len(others):
+                found.append(_effect("gain of others", OTHERS_GAIN, (self.robot == others[:, None])[:, :, None] * own))
         if time_s is not None:
             along = v.ravel()[:, None] * v.ravel()
             none = np.zeros((0, v.size))
@@ -264,11 +270,14 @@ class Observed:
             ]
             if rolled is not None:
                 pushed = [(vectors.ravel()[:, None] * vectors.ravel()) for vectors in (own, quarter_turn(own))]
-                found.append(Effect("rolling", *ROLLING, none, sum(pushed) * self.there.alike_in_time(ROLLING_S)))
+                alike = self.there.alike_in_time(ROLLING_S)
+                if self.robot.any():
+                    alike = alike * _of_components(self.robot[:, None] == self.robot)
+                found.append(Effect("rolling", *ROLLING, none, sum(pushed) * alike))
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
         noise = float(np.median(here.std_um_s))
-        if here.tracer is not None:
+        if here.tracer is not None and (here.tracer >= 0.0).any():
             same = _of_components((here.tracer[:, None] == here.tracer) & (here.tracer >= 0.0))
             found.append(Effect("height", *HEIGHT, np.zeros((0, v.size)), v.ravel()[:, None] * v.ravel() * same))
         found += [_effect(name, (DISTURBED[0] * noise, DISTURBED[1]), every) for name, every in here.disturbances]
@@ -294,6 +303,12 @@ class Observed:
         """(n, 1) 1 for observations of the robot, 0 for those of tracers."""
         tracer = self.operator.tracer
         return np.ones((self.operator.count, 1)) if tracer is None else (tracer[:, None] < 0.0).astype(np.float64)
+
+    @property
+    def robot(self) -> Floats:
+        """(n,) number of the robot that was observed; below 0 for a tracer."""
+        tracer = self.operator.tracer
+        return np.zeros(self.operator.count) if tracer is None else -1.0 - tracer
 
     def _hindrance_size(self) -> tuple[float, float]:
         """Size of the hindrance of the own motion: median and ln_std."""

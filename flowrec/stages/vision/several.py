@@ -69,7 +69,9 @@ def first_tracks(sought: Sought, count: int, at_um: Sequence[Floats]) -> list[Tr
     With one place alone the first robot is the disc that is nearest to it, then the others in order of their distance.
     """
     found = _apart(list(_everywhere(sought, 2 * count)), sought.robot.radius_um / sought.calibration.um_per_px)
-    found = sorted(found, key=lambda disc: -disc.score * disc.darkness)[:count]
+    found = sorted(found, key=lambda disc: -disc.score * disc.darkness)
+    if len(at_um) < count:
+        found = found[:count]
     chosen: list[Disc | None] = []
     for at in [*at_um, *[at_um[0]] * (count - len(at_um))]:
         x, y = sought.calibration.to_px(at).tolist()

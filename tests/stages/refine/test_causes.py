@@ -218,3 +218,35 @@ def test_the_expected_error_is_as_large_as_the_error_over_several_surveys(twin):
         expected.append(refined.error_share)
     # The walls of the twin are right; the expected error is that of walls as they usually are.
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) / np.mean(expected) < 1.5
+
+
+def test_another_robot_has_a_response_of_its_own_which_is_not_taken_for_flow(twin):
+    """The first robot saw the stem only; the second one all channels, and it rolls 25 % farther than is stated."""
+    case = twin(truth=(120.0, 0.0, 0.0))
+    first, second = flown(case, seed=1, count=80).only(slice(0, 12)), flown(case, seed=2, gain=0.25)
+    alone, both, taken_for_the_first = (
+        SETTINGS.refine(case.assumed, each, case.chip, case.solver)
+        for each in (first, first.with_robots({2: second}), first.followed_by(second))
+    )
+    assert case.error(both) < 0.5 * min(case.error(alone), case.error(taken_for_the_first))
+    value, std = found(both, "um_per_rev_share")
+    assert abs(value) < max(3.0 * std, 0.02)
+    fast = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
+    off = (both.velocity_um_s - case.true.velocity_um_s)[fast] / both.std_um_s[fast]
+    assert np.mean(np.abs(off) < 2.0) > 0.9
+
+
+def test_robots_leave_their_courses_each_for_itself(twin):
+    case = twin()
+    one, two = flown(case, seed=1, count=20), flown(case, seed=2, count=20)
+    joined = one.with_robots({1: two})
+    settings = Assimilate()
+    model = flow_model(settings, settings.model, case.chip, case.solver)
+    operator = observation_operator(joined, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
+    effects = {effect.name: effect for effect in Observed.of(model, operator).effects(model.base, None)}
+    rolling, wander = effects["rolling"].kernel, effects["wander 2 s"].kernel
+    assert np.abs(rolling[:40, :40]).max() > 0.0 and not rolling[:40, 40:].any()
+    assert np.abs(wander[:40, 40:]).max() > 0.0, "the pump is one"
+    (others,) = effects["gain of others"].columns
+    assert not others[:40].any() and others[40:].any()
+    assert "height" not in effects
