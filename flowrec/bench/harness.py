@@ -126,8 +126,8 @@ def _common(as_json: AsJson = False, out: JsonFile = None, overwrite: Overwrite 
     """Declares the options of every bench."""
 
 
-def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str]) -> None:
-    """Print a table: a format string of the row's keys by heading, as in {"RMSE": "{rmse_um:.1f}"}. None is "-"."""
+def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str], text: str = "") -> None:
+    """Print a `table`: a format string of the row's keys by heading, as in {"RMSE": "{rmse_um:.1f}"}. None is "-"."""
 
     def cell(template: str, row: Results) -> str:
         try:
@@ -135,7 +135,9 @@ def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str]) -> 
         except TypeError:  # None has no format
             return "-"
 
-    table(title, tuple(columns), [tuple(cell(template, row) for template in columns.values()) for row in rows])
+    table(
+        title, tuple(columns), [tuple(cell(template, row) for template in columns.values()) for row in rows], text=text
+    )
 
 
 def need_matplotlib() -> None:

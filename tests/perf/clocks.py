@@ -15,9 +15,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from flowrec.bench.harness import Results, Seed, run
+from flowrec.bench.harness import Results, Seed, print_rows, run
 from flowrec.core.clocks.device_clock import DeviceClock, Fit
-from flowrec.core.terminal import table
 from flowrec.core.units import NS_PER_S
 
 _RATE_HZ = 100.0
@@ -161,26 +160,18 @@ METHODS: dict[str, Callable[[Series], tuple[NDArray[np.float64], str]]] = {
 
 def show(figures: dict[str, Any]) -> None:
     """Print the table."""
-    rows = [
-        (
-            row["case"],
-            row["method"],
-            *(_told(row[name]) for name in ("mean_s", "rms_s", "p99_s", "max_s", "step_s")),
-            str(row["backwards"]),
-            f"{row['us_per_frame']:.1f}",
-            row["said"],
-        )
-        for row in figures["rows"]
-    ]
-    table(
+    print_rows(
         f"Errors of stamps in us, {figures['rate_hz']:g} Hz for {figures['seconds']:g} s, {figures['skew_ppm']:g} ppm",
-        ("case", "fit", "mean", "rms", "p99", "max", "step", "backwards", "us/frame", "detected"),
-        rows,
+        [row | {key[:-2]: 1e6 * value for key, value in row.items() if key.endswith("_s")} for row in figures["rows"]],
+        {
+            "case": "{case}",
+            "fit": "{method}",
+            **{name: f"{{{name}:.4g}}" for name in ("mean", "rms", "p99", "max", "step")},
+            "backwards": "{backwards}",
+            "us/frame": "{us_per_frame:.1f}",
+            "detected": "{said}",
+        },
     )
-
-
-def _told(error_s: float) -> str:
-    return f"{1e6 * error_s:.0f}" if abs(error_s) < 10.0 else f"{error_s:.0f} s"
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ import psutil  # type: ignore[import-untyped]
 import typer
 
 from flowrec.bench.flow import make_up
-from flowrec.bench.harness import Results, run
-from flowrec.core.terminal import progress, table
+from flowrec.bench.harness import Results, print_rows, run
+from flowrec.core.terminal import progress
 from flowrec.store.session_metadata import SessionMetadata
 
 ROOT = Path(__file__).parents[2]
@@ -285,23 +285,13 @@ def _rows(
 
 def show(results: Results) -> None:
     """Print the table."""
-    table(
-        f"{results['fault_count']} of {len(results['rows'])} trials with a fault",
-        ("verb", "signal", "moment", "status", "said", "left", "faults"),
-        [
-            (
-                row["verb"],
-                row["signal"],
-                row["moment"],
-                str(row["status"]),
-                row["said"][:100] if row["before_its_end"] else "had ended before the signal",
-                ", ".join(row["left"]),
-                "; ".join(row["faults"]),
-            )
-            for row in results["rows"]
-        ],
-        text="said",
-    )
+    rows = [
+        row | {"said": row["said"][:100] if row["before_its_end"] else "had ended before the signal"}
+        for row in results["rows"]
+    ]
+    names = ("verb", "signal", "moment", "status", "said", "left", "faults")
+    title = f"{results['fault_count']} of {len(rows)} trials with a fault"
+    print_rows(title, rows, {name: f"{{{name}}}" for name in names}, text="said")
 
 
 if __name__ == "__main__":

@@ -22,10 +22,11 @@ import numpy as np
 import zstandard
 from foxglove.mcap import MCAPCompression
 
+from flowrec.bench.harness import print_rows
 from flowrec.core.declarations import Message, message_fields
 from flowrec.core.messages import FlowField, Track
 from flowrec.core.system.processes import realtime_priority
-from flowrec.core.terminal import progress, table
+from flowrec.core.terminal import progress
 from flowrec.run.loop import SWITCH_S
 from flowrec.store.channels import message_codec
 from flowrec.store.schema import Schema
@@ -247,17 +248,17 @@ def _stall_ms(put: Callable[[int], Any], rate_hz: float, duration_s: float) -> d
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Print the medians of the rounds."""
-    table(
+    print_rows(
         "At equal terms: same bytes or messages in, chunks of 1 MiB, zstd level 1; median of the rounds",
-        ("load", "by", "us each", "MB/s", "CPU us each", "late p50 ms", "p99", "max"),
-        [
-            (
-                row["load"],
-                row["name"],
-                *((f"{row['us'][1]:.1f}", f"{row['nbytes'] / row['us'][1]:.0f}") if "us" in row else ("", "")),
-                f"{row['cpu_us'][1]:.1f}" if "us" in row else "",
-                *(f"{row[key][1]:.2f}" for key in ("p50_ms", "p99_ms", "max_ms")),
-            )
-            for row in rows
-        ],
+        [{"us": None, "cpu_us": None} | row | {"mb_s": "us" in row and row["nbytes"] / row["us"][1]} for row in rows],
+        {
+            "load": "{load}",
+            "by": "{name}",
+            "us each": "{us[1]:.1f}",
+            "MB/s": "{mb_s:.0f}",
+            "CPU us each": "{cpu_us[1]:.1f}",
+            "late p50 ms": "{p50_ms[1]:.2f}",
+            "p99": "{p99_ms[1]:.2f}",
+            "max": "{max_ms[1]:.2f}",
+        },
     )
