@@ -70,9 +70,7 @@ class PushedFile:
 class Pushed:
     """Sessions that were pushed, and the errors of those that were not.
 
-    Attributes
-    ----------
-    failed : errors, by session.
+    `failed`: errors, by session.
     """
 
     target: str
@@ -197,11 +195,8 @@ def _read_back(url: UrlPath, file: Path, content: Content, etag: str) -> str:
     """Compare an object with the file that was sent to it; returns how, '' where these credentials may not read.
 
     The answer to what was sent is no evidence, a store may keep nothing. An ETag that is the MD5 of the content says
-    that all of it has arrived; then ranges of what is stored are read, its beginning and end among them.
-
-    Raises
-    ------
-    SessionError : it does not hold what was sent.
+    that all of it has arrived; then ranges of what is stored are read, its beginning and end among them. Raises
+    SessionError: it does not hold what was sent.
     """
     wrong = SessionError(f"{url}: does not hold what was sent; delete it, and push again")
     forget(url)

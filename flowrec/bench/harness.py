@@ -179,10 +179,7 @@ def cut_torn_end(path: Path) -> None:
 def choose_names(what: str, names: str | None, known: Iterable[str]) -> tuple[str, ...]:
     """The names in "A,B", all known ones if there are none given.
 
-    Raises
-    ------
-    UsageError
-        If a name is not known; `what` is the kind of name, as in "bench flow: no method".
+    Raises UsageError if a name is not known; `what` is the kind of name, as in "bench flow: no method".
     """
     known = tuple(known)
     wanted = known if names is None else tuple(dict.fromkeys(names.split(",")))

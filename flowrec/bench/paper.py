@@ -159,10 +159,7 @@ def measure(
 ) -> Results:
     """Rows by experiment and cell: how many there are, and how long all of them take.
 
-    Raises
-    ------
-    UsageError
-        If there is no such experiment, the rows in the folder can not be read, or a package is missing.
+    Raises UsageError if there is no such experiment, the rows in the folder can not be read, or a package is missing.
     """
     names = choose_names("bench paper: no experiment", only, experiments)
     if importlib.util.find_spec("pyarrow") is None:

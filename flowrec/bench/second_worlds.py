@@ -238,10 +238,7 @@ def _right_words(world: SecondWorld, faults: Sequence[str], offset_px: Floats) -
 def make_survey(world: str, seed: int) -> MadeSurvey:
     """The survey of a world and a seed; chip and survey of a seed differ between worlds only by their faults.
 
-    Raises
-    ------
-    FlowError
-        If no flow can be solved on any chip that is drawn.
+    Raises FlowError if no flow can be solved on any chip that is drawn.
     """
     faults = faults_of(world, seed)
     for attempt in range(_ATTEMPTS):

@@ -111,12 +111,7 @@ def _keep(function: Callable[[type], Result]) -> Callable[[type], Result]:
 
 @_keep
 def message_fields(message_type: type) -> tuple[MessageField, ...]:
-    """The fields of a message type, in order.
-
-    Raises
-    ------
-    TypeError : an annotation that has no wire form.
-    """
+    """The fields of a message type, in order. Raises TypeError: an annotation that has no wire form."""
     return tuple(_declared_fields(message_type))
 
 
@@ -199,9 +194,7 @@ class as_read:  # noqa: N801 - a context
 class Message:
     """Base of all records: sets the dtype of the arrays, makes them read-only, and refuses numbers that are not finite.
 
-    Raises
-    ------
-    NotFiniteError : NaN or infinity in a field whose declaration does not permit it, outside of `as_read`.
+    Raises NotFiniteError: NaN or infinity in a field whose declaration does not permit it, outside of `as_read`.
     """
 
     __slots__ = ()

@@ -48,12 +48,7 @@ class Method:
     settings: Any = None
 
     def load(self) -> Any:
-        """Import the object that implements the method.
-
-        Raises
-        ------
-        UsageError : a package of `extra` is not installed.
-        """
+        """Import the object that implements the method. Raises UsageError: a package of `extra` is not installed."""
         try:
             return pkgutil.resolve_name(self.target)
         except ModuleNotFoundError as error:
@@ -72,9 +67,7 @@ class Method:
     def section(self, stage: Any) -> Any:
         """The section of its settings, its only option, in those of its stage: it is the method itself.
 
-        Raises
-        ------
-        UsageError : it is of a package of others, and the settings are not there or of another version.
+        Raises UsageError: it is of a package of others, and the settings are not there or of another version.
         """
         found = getattr(stage, self.options[0], None)
         if self.source is not None and not isinstance(found, self.settings):
@@ -159,9 +152,7 @@ class Methods(Mapping[str, Method]):
     def outside(self, name: str) -> Method | None:
         """The row of a package of others; None if no package declares one of that name, or it is one of ours.
 
-        Raises
-        ------
-        UsageError : the package can not be imported, or what it declares is no row of this table.
+        Raises UsageError: the package can not be imported, or what it declares is no row of this table.
         """
         if name in self._rows:
             return None

@@ -43,9 +43,7 @@ def wrap_rad(angle_rad: float) -> float:
 def amounts(text: str) -> dict[str, list[float]]:
     """Times (key `s`, in s) and sizes (key `mb`, in MB) in a text such as `10min`, `2GB` or `30s,10s`.
 
-    Raises
-    ------
-    ValueError : a part of the text is neither.
+    Raises ValueError: a part of the text is neither.
     """
     found: dict[str, list[float]] = {kind: [] for kind in _PER}
     for part in text.split(","):

@@ -57,13 +57,11 @@ class Exporter(Protocol):
     def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         """Write a new file, or fill an empty folder, which gets its name when this returns.
 
+        Raises SessionError: the session has nothing that this format holds, in one line. An OSError without a file
+        name, or with one inside `part`, becomes the error "can not be written".
+
         Parameters
         ----------
         part : the empty file or the empty folder; the suffix of a file is that of the output.
         progress : takes the session time in s since the first tick.
-
-        Raises
-        ------
-        SessionError : the session has nothing that this format holds, in one line. An OSError without a file name, or
-            with one inside `part`, becomes the error "can not be written".
         """

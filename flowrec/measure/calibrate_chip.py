@@ -137,6 +137,9 @@ def calibrate_chip(
 ) -> PictureChip:
     """Find the channel in a picture; write `out` (TOML), the mask of the same stem (PNG) and an overlay.
 
+    Raises FlowrecError: one line: the picture can not be read, shows no channel for sure, or the outputs may not be
+    written.
+
     Parameters
     ----------
     path : an image file, a movie or a session, of which the median is taken.
@@ -148,10 +151,6 @@ def calibrate_chip(
     channel : red, green, blue or grey of colours.
     wall_shift_um : all walls are moved outwards by so much; a known width shows by how much.
     seen : of an earlier call with the same picture, so that the channel need not be looked for again.
-
-    Raises
-    ------
-    FlowrecError : one line: the picture can not be read, shows no channel for sure, or the outputs may not be written.
     """
     if walls not in get_args(Shown):
         raise UsageError(f"--walls {walls}: choose one of {', '.join(get_args(Shown))}")

@@ -94,9 +94,7 @@ def calibrate_motion(
 ) -> MotionCalibration:
     """Compare the track of a session with what its coils did, and write the settings found to `out` if it is given.
 
-    Parameters
-    ----------
-    coils : another log, on any clock; None: the session's own.
+    `coils`: another log, on any clock; None: the session's own.
 
     Raises
     ------

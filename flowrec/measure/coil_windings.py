@@ -63,9 +63,7 @@ class Winding(NamedTuple):
 def winding_of(text: str) -> Winding:
     """The winding of a text, as in x:helmholtz:50:120, -y:pair:60:150:55, z:coil:30:200:25 or x:maxwell:50:80.
 
-    Raises
-    ------
-    UsageError : one line: a text of another form, or a number that is no length.
+    Raises UsageError: one line: a text of another form, or a number that is no length.
     """
     where = f"--winding {text}"
     axis, *rest = (part.strip().lower() for part in text.split(":"))

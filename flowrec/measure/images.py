@@ -103,11 +103,8 @@ class SourcePicture(NamedTuple):
 def read_picture(path: Path, channel: str | None = None) -> SourcePicture:
     """The picture in a file: what does not move, if the file holds many images.
 
-    `channel` chooses red, green, blue or grey of colours.
-
-    Raises
-    ------
-    FlowrecError : one line: no such file, none that can be read, or colour without a choice.
+    `channel` chooses red, green, blue or grey of colours. Raises FlowrecError: one line: no such file, none that can be
+    read, or colour without a choice.
     """
     if not path.exists():
         raise UsageError(f"{path}: no such picture; it is an image file, a movie, or a session")

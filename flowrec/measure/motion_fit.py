@@ -105,7 +105,7 @@ def fit_motion(
     log_error_s: float = 0.0,
     own_log: bool = False,
 ) -> MotionFit:
-    """Place a movie in a log.
+    """Place a movie in a log. Raises UsageError: too few frames, a robot that does not move, or a log without turns.
 
     Parameters
     ----------
@@ -116,10 +116,6 @@ def fit_motion(
     exact_log : it tells what the field did; else what was commanded, which takes effect within a turn of the field.
     log_error_s : standard error of the times at which the log says that the field changed.
     own_log : it is that of this run for certain.
-
-    Raises
-    ------
-    UsageError : too few frames, a robot that does not move, or a log without turns.
     """
     time_s, positions = _check_track(stamps_s, positions_um)
     carried = _flow_displacement(time_s, positions, flow)

@@ -51,9 +51,7 @@ def search(
 ) -> tuple[list[Candidate], float]:
     """Candidates for the place of a movie in a log, best first; none where the log has no turns.
 
-    Parameters
-    ----------
-    log_span_s : first and last time of the log.
+    `log_span_s`: first and last time of the log.
 
     Returns
     -------

@@ -90,11 +90,8 @@ def register(
 ) -> tuple[WallFit, ...]:
     """The poses of a chip that explain a picture (h, w) equally well, best first; usually one.
 
-    `um_per_px` is the range that is searched, `mirrors` says whether mirror images are.
-
-    Raises
-    ------
-    ChipError : one line: the picture does not show this chip, or does not determine how it lies.
+    `um_per_px` is the range that is searched, `mirrors` says whether mirror images are. Raises ChipError: one line: the
+    picture does not show this chip, or does not determine how it lies.
     """
     if _is_small(picture):
         least = f"{_LEAST_PX} x {_LEAST_PX}"

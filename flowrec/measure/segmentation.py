@@ -105,16 +105,14 @@ class Segmentation:
 def segment(picture: Image, shown: Shown = "auto", seeds_px: Sequence[tuple[float, float]] = ()) -> Segmentation:
     """The channel in a picture (h, w).
 
+    Raises ChipError: one line: nothing in the picture is surely a channel, several things may be one, or the points
+    contradict what is seen.
+
     Parameters
     ----------
     shown : how the walls show; auto: all of these are tried.
     seeds_px : points x, y in the channel. Without any the channel is the side of the walls that does not hold the
         corners of the picture; with them it is what is connected with one of them.
-
-    Raises
-    ------
-    ChipError : one line: nothing in the picture is surely a channel, several things may be one, or the points
-        contradict what is seen.
     """
     full = np.asarray(picture, np.float32)
     height, width = full.shape

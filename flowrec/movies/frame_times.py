@@ -49,15 +49,14 @@ class FrameTimes:
 def frame_times(path: Path, facts: MovieFacts, table: str = "", rate_hz: float | None = None) -> FrameTimes:
     """The times of a movie.
 
+    Raises MovieError: in one line: no times at all, both kinds of them, times that go back, more or fewer rows than
+    images.
+
     Parameters
     ----------
     table : CSV or Excel file with a column time_s (other units, dates: see `Table.times_s`) and a row
         for each image in order; '': none. A column frame holds the camera's own numbers, so that a gap is a loss.
     rate_hz : images per second, instead.
-
-    Raises
-    ------
-    MovieError : in one line: no times at all, both kinds of them, times that go back, more or fewer rows than images.
     """
     if table and rate_hz is not None:
         raise MovieError(f"{path}: times are given by {table} and by a rate; give one of --times and --fps")

@@ -144,9 +144,7 @@ class Movie(ABC):
     def frames(self) -> Iterator[MovieFrame]:
         """All images in order.
 
-        Raises
-        ------
-        MovieError : an image can not be read, and `options.partial` is not set; the text says how many could.
+        Raises MovieError: an image can not be read, and `options.partial` is not set; the text says how many could.
         """
         times = self.facts.times_ns
         for index in range(self.facts.frames):
@@ -188,13 +186,7 @@ class Movie(ABC):
     def _depth(self, kept: int, stated: int | None = None, who: str = "the file does not say how many of its") -> int:
         """The depth of PIXEL_BITS of pixels that are kept in so many bits; the one that was asked for, if any.
 
-        Parameters
-        ----------
-        stated : number of significant bits by the file.
-
-        Raises
-        ------
-        MovieError : more bits than an image can have.
+        `stated`: number of significant bits by the file. Raises MovieError: more bits than an image can have.
         """
         if self.options.bits is not None:
             return self.options.bits

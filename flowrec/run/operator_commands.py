@@ -90,10 +90,8 @@ HELP = "keys: " + "   ".join(f"{'space' if row.key == ' ' else row.key} {row.wor
 def obey(control: RunControl, words: dict[str, Any]) -> str:
     """Give a command of the console to the run; why it does not take it, '' where it does.
 
-    Parameters
-    ----------
-    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), `name` and `value` of
-        an output, of a hand what `_steer` takes, else `text`.
+    `words`: `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), `name` and `value` of
+    an output, of a hand what `_steer` takes, else `text`.
     """
     try:
         name = words["command"]

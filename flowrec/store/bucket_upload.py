@@ -74,13 +74,8 @@ class Sent:
 class LocalParts:
     """A file, in the parts in which it is sent.
 
-    Attributes
-    ----------
-    content : of the file, once `read_all` has come to its end.
-
-    Raises
-    ------
-    SessionError : it can not be read, or changes while it is read.
+    `content`: of the file, once `read_all` has come to its end. Raises SessionError: it can not be read, or changes
+    while it is read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -173,9 +168,7 @@ class Bucket:
     def upload(self, path: Path, progress: Callable[[int], None]) -> Sent | None:
         """Send a file; None if there is an object of its name already.
 
-        Parameters
-        ----------
-        progress : takes the bytes of the file that the bucket has.
+        `progress`: takes the bytes of the file that the bucket has.
         """
         name = path.name
         with closing(LocalParts(path)) as parts:

@@ -61,9 +61,7 @@ class Losses:
 class RecoveryTally:
     """Ticks and messages of a file that are kept, and those that have to be left out; all times are those of ticks.
 
-    Attributes
-    ----------
-    undeclared : messages of channels whose declaration was not found, or is damaged.
+    `undeclared`: messages of channels whose declaration was not found, or is damaged.
     """
 
     def __init__(self, contents: SessionContents) -> None:
@@ -162,20 +160,14 @@ def _array(times: array[int]) -> NDArray[np.int64]:
 class ChunkCopier:
     """Copies chunk after chunk while a file is scanned.
 
+    `draws`: the viewer topics are not copied, but made again from what is kept. Those of another flowrec, which has
+    declared them otherwise, stay. Raises OSError: from any method, when the disk refuses.
+
     Parameters
     ----------
     contents : the file, with all that is declared in it.
     out : the new file, not begun.
     tally : receives what is kept and what is left out.
-
-    Attributes
-    ----------
-    draws : the viewer topics are not copied, but made again from what is kept. Those of another flowrec, which has
-        declared them otherwise, stay.
-
-    Raises
-    ------
-    OSError : from any method, when the disk refuses.
     """
 
     def __init__(self, contents: SessionContents, out: McapWriter, tally: RecoveryTally) -> None:

@@ -74,10 +74,8 @@ def row_differences(image: Image) -> Payload:
 def decode_image(data: bytes | memoryview, bits: int = 8) -> Image:
     """The pixels of a PNG or JPEG file, (h, w) grey levels, uint8 for a depth of 8 bits and uint16 for more.
 
-    Raises
-    ------
-    ValueError : it is neither, it is coloured, its pixels have another size than those of the depth, or it claims more
-        of them than its bytes or the limit allow.
+    Raises ValueError: it is neither, it is coloured, its pixels have another size than those of the depth, or it claims
+    more of them than its bytes or the limit allow.
     """
     data, expected = memoryview(data), pixel_type(bits)
     height, width = _shape_of(data, 8 * expected.itemsize)

@@ -99,9 +99,7 @@ class Summary:
     def enter(self, record: Schema | Channel | Metadata | Attachment, offset: int, length: int) -> None:
         """Enter a record outside the chunks, which stands at a place in the file.
 
-        Raises
-        ------
-        ValueError : another schema or channel has the same number.
+        Raises ValueError: another schema or channel has the same number.
         """
         if isinstance(record, Metadata):
             self.metadata.append(MetadataIndex(offset, length, record.name))
@@ -130,9 +128,7 @@ class Summary:
     def to_session_clock(self, start_unix_ns: int) -> None:
         """Turn the Unix times of the chunks into stamps of a session that started at `start_unix_ns`.
 
-        Raises
-        ------
-        ValueError : a chunk is before the start.
+        Raises ValueError: a chunk is before the start.
         """
         if not self.chunks or not start_unix_ns:
             return

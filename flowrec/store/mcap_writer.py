@@ -52,11 +52,8 @@ _BUFFERS_PER_WRITE = 1024  # IOV_MAX of Linux
 class McapWriter:
     """An MCAP file open for appending. When a method returns, the operating system has the bytes.
 
-    It is locked until it is closed, so that no other process writes it or takes it for the rest of a killed run.
-
-    Raises
-    ------
-    OSError : from any method, when the disk refuses.
+    It is locked until it is closed, so that no other process writes it or takes it for the rest of a killed run. Raises
+    OSError: from any method, when the disk refuses.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:

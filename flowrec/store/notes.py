@@ -49,9 +49,7 @@ def notes_file(session: Path) -> Path:
 def read_notes(session: Path, key: str) -> list[Note]:
     """The notes of the session with a key, in order; lines that are damaged or of another session are left out.
 
-    Raises
-    ------
-    SessionError : the file can not be read.
+    Raises SessionError: the file can not be read.
     """
     lines = notes_content(notes_file(session)).split(b"\n")
     notes = (_parse(line, key) for line in lines if 0 < len(line) <= _LINE_LIMIT)

@@ -122,9 +122,7 @@ class ListedObject:
 def listing(url: str, begin: str, timeout_s: float) -> list[ListedObject]:
     """The objects of a folder in a bucket, without folders in it, in order of name.
 
-    Parameters
-    ----------
-    begin : only those whose names begin so; few are asked for, however many are in the folder.
+    `begin`: only those whose names begin so; few are asked for, however many are in the folder.
 
     Raises
     ------

@@ -156,16 +156,14 @@ def scan(
 ) -> Scan:
     """Read all of a file and index its intact records; one chunk is in memory at a time.
 
+    Raises SessionError: the file can not be read.
+
     Parameters
     ----------
     visit : receives place and messages of every intact chunk, in file order.
     progress : receives the byte up to which the file has been read.
     digests : sum up the digests of the messages.
     heads_only : pass over the content of chunks: only what is declared outside them is found.
-
-    Raises
-    ------
-    SessionError : the file can not be read.
     """
     source.read_originals()
     found = Scan(source, visit, source.start_unix_ns if digests else None)

@@ -147,7 +147,8 @@ class SessionFile:
     Data older than `flush_s`, in wall time or in stamps, has been passed to the operating system. Data older than
     `sync_s` is on the disk, as long as one fsync takes less than half of that. The fsync runs in a side thread: on a
     busy disk it may take a second, in which a camera would fill the queue. That thread writes, too, what would delay
-    the caller: a keyframe, and with a `limit_bytes` all chunks. What is put later than that waits for it.
+    the caller: a keyframe, and with a `limit_bytes` all chunks. What is put later than that waits for it. Raises
+    FileError: from any method, when the disk refuses; what fails in the side thread is raised by `check`.
 
     Parameters
     ----------
@@ -163,10 +164,6 @@ class SessionFile:
     first_bytes : size of header and keyframe.
     failure : the first error, after which nothing is written; `flowrec recover` reads what was written before.
     completion : that of `complete` in another thread, once the file has received all that belongs into it.
-
-    Raises
-    ------
-    FileError : from any method, when the disk refuses; what fails in the side thread is raised by `check`.
     """
 
     def __init__(

@@ -165,6 +165,8 @@ def is_header_file(name: str) -> bool:
 class SessionMetadata:
     """The index and the metadata of a session file.
 
+    Raises SessionError: it is no session file, or not one for this flowrec.
+
     Parameters
     ----------
     path : the file.
@@ -180,10 +182,6 @@ class SessionMetadata:
     flowrec_version : of the program that wrote it.
     digest : of the content, as it was recorded (digest.py); None in files of the first release.
     channels, schemas, attachments, metadata : what else is listed.
-
-    Raises
-    ------
-    SessionError : it is no session file, or not one for this flowrec.
     """
 
     def __init__(self, path: Path, summary: Summary | None = None) -> None:
@@ -307,9 +305,7 @@ class SessionMetadata:
 def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
     """Position of a file in its run, from its metadata records.
 
-    Raises
-    ------
-    ValueError : the values of the record are invalid.
+    Raises ValueError: the values of the record are invalid.
     """
     facts = records.get(PART)
     if facts is None:

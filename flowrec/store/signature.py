@@ -49,9 +49,8 @@ def refuse_unusable_key(key: Path) -> None:
 def sign_file(session: Path, key: Path, *, overwrite: bool) -> Path:
     """Sign a file; the path of the signature. A key with a passphrase asks for it, or is used by its agent.
 
-    Raises
-    ------
-    FlowrecError : the key can not be used, or OpenSSH is not installed; OutputError if there is a signature already.
+    Raises FlowrecError: the key can not be used, or OpenSSH is not installed; OutputError if there is a signature
+    already.
     """
     made = signature_file(session)
     if made.exists() and not overwrite:
@@ -66,13 +65,8 @@ def sign_file(session: Path, key: Path, *, overwrite: bool) -> Path:
 def verify_file(session: Path, signers: Path | None) -> Signature | None:
     """Verify the signature of a file; None: it has none.
 
-    Parameters
-    ----------
-    signers : the keys that are trusted, and whose they are, as of `ssh-keygen(1)`, ALLOWED SIGNERS.
-
-    Raises
-    ------
-    FlowrecError : the list can not be read, or OpenSSH is not installed.
+    `signers`: the keys that are trusted, and whose they are, as of `ssh-keygen(1)`, ALLOWED SIGNERS. Raises
+    FlowrecError: the list can not be read, or OpenSSH is not installed.
     """
     made = signature_file(session)
     if signers is not None and not signers.is_file():

@@ -139,18 +139,15 @@ _WANTED = f"the columns are {', '.join(_NAMES[:_NEEDED])} and, where known, {', 
 def observations_of(given: Any, radius_um: float | None = None) -> Observations:
     """Observations from a table with a row each, in the columns OBSERVED.
 
-    Without `std_um_s` it is 5 % of the root mean square speed. A column that may be left out may be empty.
+    Without `std_um_s` it is 5 % of the root mean square speed. A column that may be left out may be empty. Raises
+    UsageError: one line with the shape and the columns that are wanted: a missing column, another shape, no row, NaN or
+    infinity, a standard deviation that is not more than zero.
 
     Parameters
     ----------
     given : path of a CSV or Excel file; a pandas DataFrame, or anything with columns by name; an array (n, 4 to 8) with
         the columns in this order; or Observations, which are returned as they are.
     radius_um : of the robot or particle, which the flow carries as a sphere; None: not stated.
-
-    Raises
-    ------
-    UsageError : one line with the shape and the columns that are wanted: a missing column, another shape, no row, NaN
-        or infinity, a standard deviation that is not more than zero.
     """
     if isinstance(given, Observations):
         return given

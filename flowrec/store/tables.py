@@ -64,13 +64,7 @@ class Tables:
     def batches(self, rows: Iterable[tuple[str, tuple[Any, ...]]]) -> Iterator[tuple[str, pa.RecordBatch]]:
         """The rows of several topics as record batches of each, in order.
 
-        Parameters
-        ----------
-        rows : topic, by its field of `Tick`, and row.
-
-        Raises
-        ------
-        SessionError : a message has another number of coils.
+        `rows`: topic, by its field of `Tick`, and row. Raises SessionError: a message has another number of coils.
         """
         waiting: dict[str, list[tuple[Any, ...]]] = {}
         nbytes: dict[str, int] = {}
@@ -157,12 +151,7 @@ def observed_flow(observations: Observations) -> pa.Table:
 
 
 def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
-    """A flow field with a row for each pixel of fluid.
-
-    Parameters
-    ----------
-    fluid : (h, w), where the chip holds fluid.
-    """
+    """A flow field with a row for each pixel of fluid. `fluid`: (h, w), where the chip holds fluid."""
     columns = zip(VALUES, values_of(field, fluid).T, strict=True)
     return _table(VALUES, [None if field.std_um_s is None and "std" in name else values for name, values in columns])
 

@@ -38,9 +38,7 @@ def leftovers(folder: Path) -> list[Path]:
 def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> dict[Path, str]:
     """Recover small unfinished sessions and print the command for larger ones, a line for each; never raises for one.
 
-    Parameters
-    ----------
-    excluded : remains to leave locked, because they will be overwritten.
+    `excluded`: remains to leave locked, because they will be overwritten.
 
     Returns
     -------

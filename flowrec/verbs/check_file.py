@@ -54,9 +54,7 @@ NOT_EXACT = "yes, but not exact after the first missing message"
 class FileCheck:
     """Reads one file and fills its verdict, one method for each subject.
 
-    Attributes
-    ----------
-    read_bytes : how far it is.
+    `read_bytes`: how far it is.
     """
 
     def __init__(self, path: Path, progress: Callable[[], None]) -> None:

@@ -287,9 +287,7 @@ def _documentation(function: Callable[..., Any]) -> str:
 def outside_verb(name: str) -> Any:
     """The verb of a name that a package of others brings, as a command for typer; None if none does.
 
-    Raises
-    ------
-    UsageError : its package can not be imported, or declares no function.
+    Raises UsageError: its package can not be imported, or declares no function.
     """
     from flowrec.core import VERBS, the_one
 

@@ -20,9 +20,7 @@ _SLICE_S = 0.5  # of the wait for Ctrl-C
 class Flown:
     """A mission that was flown on emulated devices, or none.
 
-    Attributes
-    ----------
-    exit_status : of the recorder.
+    `exit_status`: of the recorder.
     """
 
     def __init__(self, session: Path | None = None, exit_status: int = 0, latency: str = "") -> None:

@@ -69,9 +69,7 @@ def kind_of(name: str) -> type:
 def columns_of(listed: ListedSession, path: str) -> dict[str, Any]:
     """Values by column, each of the kind of its column, None if unknown; LISTS are lists of texts.
 
-    Parameters
-    ----------
-    path : of the session, as the column of that name states it.
+    `path`: of the session, as the column of that name states it.
     """
     stated = ((key.lower(), value) for key, value in listed.as_json().items() if _is_name(key))
     facts = dict(itertools.islice(stated, _FACTS_LIMIT))

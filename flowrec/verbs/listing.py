@@ -57,11 +57,8 @@ def list_sessions(places: Iterable[Path], where: str, sort: str) -> list[ListedS
 def read_each(read: Callable[[T], R], sessions: Iterable[T], far: bool) -> Iterator[Iterator[R]]:
     """Context with what `read` returns of each session, in their order.
 
-    What has not begun when the context is left is not read: a person who interrupts does not wait for it.
-
-    Parameters
-    ----------
-    far : some are at URLs, where each waits for its server: many are read at a time.
+    What has not begun when the context is left is not read: a person who interrupts does not wait for it. `far`: some
+    are at URLs, where each waits for its server: many are read at a time.
     """
     if not far:
         yield map(read, sessions)

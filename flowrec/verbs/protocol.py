@@ -110,13 +110,8 @@ def walk(
 ) -> DayProtocol:
     """Measure what has not passed yet, in order.
 
-    Parameters
-    ----------
-    only : names of the rows that are measured, again if they have passed; (): all that have not.
-
-    Raises
-    ------
-    UsageError : there is no such row. FlowrecError : the configuration describes no lab.
+    `only`: names of the rows that are measured, again if they have passed; (): all that have not. Raises UsageError:
+    there is no such row. FlowrecError : the configuration describes no lab.
     """
     unknown = set(only) - {row.name for row in ROWS}
     if unknown:

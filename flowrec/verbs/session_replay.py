@@ -294,9 +294,7 @@ def _with_recorded_region(session: Session, config: ResolvedConfig) -> ResolvedC
 def hindsight(session: Session, pipeline: Pipeline) -> Callable[[int], Observations]:
     """The flow observations up to a stamp by the RTS smoother, for `sampler.method = "smoothed"`.
 
-    Raises
-    ------
-    UsageError : the observer is not the Kalman filter, whose model the smoother shares.
+    Raises UsageError: the observer is not the Kalman filter, whose model the smoother shares.
     """
     if "kalman" not in OBSERVERS[pipeline.observer.method].options:
         able = " or ".join(f"'{row.name}'" for row in OBSERVERS.values() if "kalman" in row.options)

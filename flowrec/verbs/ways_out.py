@@ -75,9 +75,7 @@ WAYS = (
 def zero_on_ways(day: Day) -> tuple[float, float, str]:
     """The longest time of all ways in % of what it may take, 100, and all of them as text.
 
-    Raises
-    ------
-    FlowrecError : the time of a way is not known: nobody has read it, or its run made no field.
+    Raises FlowrecError: the time of a way is not known: nobody has read it, or its run made no field.
     """
     shares, told = [], []
     for way in WAYS:

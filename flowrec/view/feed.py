@@ -51,6 +51,8 @@ class Batch(NamedTuple):
 class Feed:
     """A process that reads pickled objects from its stdin: first `first`, then batches.
 
+    Raises OSError: the process does not start.
+
     Parameters
     ----------
     command : module of flowrec, and its words.
@@ -58,10 +60,6 @@ class Feed:
     shown : the fields of a tick that are sent.
     remarks : asked for each batch, by the thread.
     answers : whether the process writes to a pipe, `process.stdout`; otherwise all its output goes to its log.
-
-    Raises
-    ------
-    OSError : the process does not start.
     """
 
     def __init__(
@@ -128,9 +126,7 @@ class Feed:
     def close(self, timeout_s: float, stays: str = "", last: object = None) -> bool:
         """Send the last ticks and `last` within a time limit, then end the process; whether it stays instead.
 
-        Parameters
-        ----------
-        stays : words by which the process says that it will end by itself.
+        `stays`: words by which the process says that it will end by itself.
         """
         self._last = last
         self._closing.set()

@@ -97,11 +97,8 @@ def url(port: int) -> str:
 def start(arguments: list[str], log: Path | None = None) -> subprocess.Popen[bytes]:
     """Start the viewer with its server on the loopback interface only, in a session of its own.
 
-    Ctrl-C in the terminal does not reach it, so it can outlive the run and show its end.
-
-    Raises
-    ------
-    OSError : there is no viewer, or it does not start.
+    Ctrl-C in the terminal does not reach it, so it can outlive the run and show its end. Raises OSError: there is no
+    viewer, or it does not start.
     """
     program = executable()
     if program is None:

@@ -47,9 +47,7 @@ class Known:
 def read(path: Path) -> Known:
     """Read the contents of an earlier catalog: no session where there is none, or it can not be used.
 
-    Raises
-    ------
-    OutputError : the file is something else, which is never replaced.
+    Raises OutputError: the file is something else, which is never replaced.
     """
     if not os.path.lexists(path):
         return Known(table_of([]))
@@ -76,9 +74,7 @@ def read(path: Path) -> Known:
 def lock_catalog(path: Path) -> Iterator[None]:
     """Keep other processes from refreshing a catalog.
 
-    Raises
-    ------
-    OutputError : another one does so just now, or the file may not be written.
+    Raises OutputError: another one does so just now, or the file may not be written.
     """
     Output(path, PARQUET, overwrite=True).check()
     lock = path.with_name(f".{path.name}{_LOCK}")

@@ -117,17 +117,14 @@ def find(where: str = "", catalog: Path | None = None, sort: str = "", limit: in
 
     `sweep.refine`, `sweep.replayed_refined_flow_error` and so on are of the session's replays in tables of `flowrec
     sweep`, `sweep.place` is 1 for the best of them; `events.time_s`, `events.action` and `events.text` are of what the
-    operator did. A session then has a row for each replay or event.
+    operator did. A session then has a row for each replay or event. Raises UsageError: there is no catalog, or the
+    expression is refused.
 
     Parameters
     ----------
     catalog : the file, or its folder; None: the one of this folder, or of the next one above that has one.
     sort : a column, with a leading `-` from the largest.
     limit : of the number of rows.
-
-    Raises
-    ------
-    UsageError : there is no catalog, or the expression is refused.
     """
     path = catalog_above(catalog).absolute()
     with open_catalog(path) as (about, table):

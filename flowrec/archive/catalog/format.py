@@ -73,9 +73,7 @@ def path_of(text: str, base: Path) -> Path:
 def catalog_above(named: Path | None) -> Path:
     """The catalog that is named, or in the folder that is; None: the one in this folder, or the next one above.
 
-    Raises
-    ------
-    UsageError : there is none.
+    Raises UsageError: there is none.
     """
     if named is not None:
         path = named / NAME if named.is_dir() else named

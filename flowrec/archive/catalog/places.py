@@ -41,9 +41,7 @@ class Found:
 def contents_of(places: Iterable[Path], without: Path) -> tuple[list[Found], list[Path]]:
     """List the sessions in folders, and those that are named, in order of name; and tables that may be of sweeps.
 
-    Parameters
-    ----------
-    without : the catalog itself.
+    `without`: the catalog itself.
 
     Raises
     ------

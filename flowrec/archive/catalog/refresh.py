@@ -188,9 +188,7 @@ def _read(due: dict[str, Found], progress: Callable[[float], None], jobs: int) -
 def row_of(found: Found, path: str) -> dict[str, Any]:
     """Values by column. A session that can not be opened is a row, too, with the reason as its note.
 
-    Parameters
-    ----------
-    path : as the catalog states it.
+    `path`: as the catalog states it.
     """
     try:
         listed, opened = describe(found.path, found.files, found.path.name)

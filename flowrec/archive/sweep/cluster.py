@@ -157,14 +157,8 @@ def _replayed_by_worker(task: Task) -> Row:
 def rows_of(client: Any, tasks: Iterable[Task], *, local: bool) -> Iterator[Row]:
     """The rows of tasks in the order in which they are done; few of them are in memory at a time.
 
-    Parameters
-    ----------
-    local : the workers are of this machine: none is given a task while it has one, so that a worker that dies fails no
-        task but its own.
-
-    Raises
-    ------
-    FlowrecError : the scheduler has ended.
+    `local`: the workers are of this machine: none is given a task while it has one, so that a worker that dies fails no
+    task but its own. Raises FlowrecError: the scheduler has ended.
     """
     waiting, running, done = iter(tasks), dict[str, Task](), distributed.as_completed()
 

@@ -67,15 +67,8 @@ class Ranking:
         """Rank the settings of some rows.
 
         Of a session that was replayed by several versions with the same settings, the last row counts. A setting that
-        has the figure in no session is last and does not narrow the common sessions.
-
-        Parameters
-        ----------
-        figure : by which they are ranked; None: the first of RANKED_BY that a row has.
-
-        Raises
-        ------
-        UsageError : no row has that figure as a number.
+        has the figure in no session is last and does not narrow the common sessions. `figure`: by which they are
+        ranked; None: the first of RANKED_BY that a row has. Raises UsageError: no row has that figure as a number.
         """
         by_settings: dict[str, dict[str, Row]] = {}
         for row in rows:

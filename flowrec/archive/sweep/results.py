@@ -80,14 +80,12 @@ class Results:
     def open_locked(cls, path: Path, inputs: Iterable[Path], contents: Collection[str]) -> Iterator[Self]:
         """The results under a name, for one process at a time; gathered into the file however the block ends.
 
+        Raises OutputError: it may not be written, or holds something else than a sweep of some of these sessions.
+
         Parameters
         ----------
         inputs : files that are read, none of which the output may be.
         contents : hashes of the sessions of this sweep.
-
-        Raises
-        ------
-        OutputError : it may not be written, or holds something else than a sweep of some of these sessions.
         """
         Output(path, PARQUET, tuple(each for each in inputs if not isinstance(each, UrlPath)), overwrite=True).check()
         results = cls(path)
@@ -231,9 +229,7 @@ def _table(rows: Sequence[Row]) -> pa.Table:
 def array_of(values: Sequence[Any], empty: pa.DataType | None = None) -> pa.Array:
     """Values of one kind; whole and broken numbers are float64, any other mixture is text.
 
-    Parameters
-    ----------
-    empty : type of values that are all unknown; None: text.
+    `empty`: type of values that are all unknown; None: text.
     """
     kinds = {type(value) for value in values if value is not None}
     if kinds == {int, float}:

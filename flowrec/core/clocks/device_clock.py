@@ -245,15 +245,8 @@ def _unwrap(fit: Fit, device: int, arrival_ns: int, wrap: int) -> tuple[int, int
 def envelope(points: tuple[Point, ...]) -> tuple[Point, float]:
     """The line below all points and nearest to them: one of its points, and its rate.
 
-    The sum of the distances is smallest for the edge of the lower convex hull that contains the points' mean.
-
-    Parameters
-    ----------
-    points : in order of device time.
-
-    Raises
-    ------
-    ValueError : fewer than two different points.
+    The sum of the distances is smallest for the edge of the lower convex hull that contains the points' mean. `points`:
+    in order of device time. Raises ValueError: fewer than two different points.
     """
     hull: list[Point] = []
     for x, y in points:

@@ -38,18 +38,12 @@ class ChildEndedError(Exception):
 class ChildProcess:
     """The process, as its parent sees it; it ends with `close`, or with the parent.
 
-    Parameters
-    ----------
-    inherited : file descriptors that it gets, too.
+    `inherited`: file descriptors that it gets, too. Raises OSError: it does not start.
 
     Attributes
     ----------
     process : that of the system.
     printed : the last part of what it has printed.
-
-    Raises
-    ------
-    OSError : it does not start.
     """
 
     def __init__(

@@ -48,9 +48,7 @@ class OutputFolder:
     def check(self) -> None:
         """Check the output before any work is done for it.
 
-        Raises
-        ------
-        OutputError : it may not be written; the text says why, and what to do.
+        Raises OutputError: it may not be written; the text says why, and what to do.
         """
         path, parent = self.path, self.path.absolute().parent
         if not path.name.endswith(self.suffixes):

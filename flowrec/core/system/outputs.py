@@ -63,13 +63,8 @@ class Output:
     def check(self, also: Iterable[Path] = ()) -> None:
         """Check the output before any work is done for it.
 
-        Parameters
-        ----------
-        also : other files that this output replaces or adds to: the parts of a session, and its unfinished files.
-
-        Raises
-        ------
-        OutputError : it may not be written; the text says why, and what to do.
+        `also`: other files that this output replaces or adds to: the parts of a session, and its unfinished files.
+        Raises OutputError: it may not be written; the text says why, and what to do.
         """
         path, suffixes, files = self.path, self.suffixes, (self.path, *also)
         if path.is_dir():

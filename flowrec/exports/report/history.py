@@ -104,9 +104,7 @@ class History:
     def of(cls, session: Session, progress: TimeProgress = lambda _: None) -> History:
         """Read a session; `progress` takes the session time in s since the first tick.
 
-        Raises
-        ------
-        SessionError : a message is damaged.
+        Raises SessionError: a message is damaged.
         """
         first_ns = session.run.first_ns
         history = cls(first_ns, first_ns + nanoseconds(session.duration_s))

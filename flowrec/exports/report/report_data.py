@@ -47,9 +47,7 @@ class ReportData:
     def of(cls, session: Session, progress: TimeProgress = lambda _: None) -> ReportData:
         """Read a session; `progress` takes the session time in s since the first tick.
 
-        Raises
-        ------
-        FlowrecError : header, chip or a message is not valid.
+        Raises FlowrecError: header, chip or a message is not valid.
         """
         config = session.config
         size_px = (config.camera.width_px, config.camera.height_px)

@@ -148,12 +148,8 @@ class GeneralisedSystem(Equations):
         """Fluxes (faces,) of the steady flow for inertia = rho h / mu in s/m.
 
         Newton's method starts from the Newtonian Stokes flow. Where it fails, continuation follows flows of increasing
-        strength of the law and increasing inertia.
-
-        Raises
-        ------
-        NotConvergedError
-            If the last step is not below `tolerance`, or ENOUGH, of the fastest velocity after `max_iterations`.
+        strength of the law and increasing inertia. Raises NotConvergedError if the last step is not below `tolerance`,
+        or ENOUGH, of the fastest velocity after `max_iterations`.
         """
         flux = self.linear(drive, push)
         if not flux.any():

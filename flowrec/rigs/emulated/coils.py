@@ -86,11 +86,8 @@ def compiler() -> str | None:
 def compiled_firmware(folder: Path, timer_ms: int = 100, coils: int = 3, *, sensors: bool = False) -> Path:
     """The board as a program in a folder, where it is kept. With `timer_ms` = 0 it does not go to zero by itself.
 
-    Boards have 3 or 6 coils, and with `sensors` they measure their currents.
-
-    Raises
-    ------
-    RigError : there is no compiler, or it refuses.
+    Boards have 3 or 6 coils, and with `sensors` they measure their currents. Raises RigError: there is no compiler, or
+    it refuses.
     """
     program = folder / f"board{timer_ms}_{coils}_{sensors}"
     if program.exists():

@@ -63,11 +63,8 @@ class SampleStream(Protocol):
     """One stream. All methods are called in one thread at a time; `open` again after `close` looks for it anew.
 
     `of(name, settings)` of a row's class in STREAM_KINDS makes one of a section [streams.NAME]; nothing is touched
-    before `open`. Settings of a kind of another package are its `Settings`, section [streams.NAME.device].
-
-    Attributes
-    ----------
-    polled : the loop's own thread calls `read`, which never waits; else a thread of the stream does.
+    before `open`. Settings of a kind of another package are its `Settings`, section [streams.NAME.device]. `polled`:
+    the loop's own thread calls `read`, which never waits; else a thread of the stream does.
     """
 
     polled: ClassVar[bool] = False
@@ -84,9 +81,7 @@ class SampleStream(Protocol):
     def read(self, timeout_s: float) -> Chunk | None:
         """The samples that have come since the last call; None if there is none within the timeout.
 
-        Raises
-        ------
-        NoStreamError : the sender has ended.
+        Raises NoStreamError: the sender has ended.
         """
 
     def correction_s(self) -> float:
@@ -113,9 +108,7 @@ class SettableStream(Protocol):
 def named_channels(settings: StreamSettings, stated: list[str], count: int) -> tuple[str, ...]:
     """Names of the channels of a stream: those of the settings, else as the sender states them, else numbers.
 
-    Raises
-    ------
-    RigError : the settings name another number of channels.
+    Raises RigError: the settings name another number of channels.
     """
     given = settings.channels or tuple(name.strip() for name in stated)
     if settings.channels and len(given) != count:
@@ -127,9 +120,7 @@ def named_channels(settings: StreamSettings, stated: list[str], count: int) -> t
 def settings_of_device(kind: Any, given: dict[str, Any], where: str) -> Any:
     """The settings of a kind of another package, from the table of a configuration.
 
-    Raises
-    ------
-    UsageError : a key or a value that they do not have; one line.
+    Raises UsageError: a key or a value that they do not have; one line.
     """
     from pydantic import TypeAdapter, ValidationError
 

@@ -70,14 +70,12 @@ class Observer:
     ) -> Estimate:
         """The estimate after this frame. The robot's own displacement is um_per_rev times the turns really applied.
 
+        Raises UsageError: `method` is not in the table.
+
         Parameters
         ----------
         field : the best flow known; ignored by methods that do not use a map. Without one, kalman_map is kalman.
         health : of the frame before, by which kalman_auto judges the map. None: not judged.
-
-        Raises
-        ------
-        UsageError : `method` is not in the table.
         """
         row = OBSERVERS[self.method]
         settings, needs = row.section(self), row.needs
