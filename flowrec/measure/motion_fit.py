@@ -27,17 +27,7 @@ from flowrec.core import FlowField, UsageError
 from flowrec.measure.motion_regression import MotionRegression, Place, TrackRegression, Turns, heading_and_size
 from flowrec.measure.motion_search import SearchRange, search
 from flowrec.physics import sample
-from flowrec.stages import (
-    FREEDOM,
-    RESTART,
-    SKIPPED,
-    USED,
-    Flags,
-    Floats,
-    fit_noise,
-    whiten,
-    without_jumps,
-)
+from flowrec.stages import FREEDOM, RESTART, SKIPPED, USED, Flags, Floats, fit_noise, whiten, without_jumps
 
 # Of 72 simulated missions all pass with their own log, which explains 0.73 to 0.97. Of 288 comparisons with logs of
 # other runs, which explain 0 to 0.5 in most cases, 2 pass: on the same chip, where the commands are nearly the same and

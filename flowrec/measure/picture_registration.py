@@ -22,15 +22,7 @@ from flowrec.core import ChipError, Image
 from flowrec.measure.images import Colours, Mask, with_curves
 from flowrec.measure.wall_fit import Fitter, WallFit
 from flowrec.measure.wall_search import WallMap, WallSearch
-from flowrec.physics import (
-    AS_STATED,
-    ORIENTATIONS,
-    Calibration,
-    Chip,
-    Orientation,
-    camera_settings,
-    median_width_um,
-)
+from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, Chip, Orientation, camera_settings, median_width_um
 
 _CANDIDATES = 12  # coarse poses that are fitted at most, the best first
 _LEAST_SCORE = 0.55  # of a candidate, relative to the best one

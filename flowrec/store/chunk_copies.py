@@ -21,15 +21,7 @@ from flowrec.store.channels import SLOTS, VIEWED, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.gathered_copies import is_copy
-from flowrec.store.mcap_format import (
-    CHUNK_HEAD,
-    LONG,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
-    Record,
-    SealedChunk,
-    records_in,
-)
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, Record, SealedChunk, records_in
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.scan import Scan
 from flowrec.store.session_metadata import DIGEST, OUTCOME

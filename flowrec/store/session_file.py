@@ -16,16 +16,7 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
-from flowrec.core import (
-    FIXED,
-    SessionError,
-    TopicTable,
-    __version__,
-    name_taken,
-    put_in_place,
-    seconds,
-    sync_directory,
-)
+from flowrec.core import FIXED, SessionError, TopicTable, __version__, name_taken, put_in_place, seconds, sync_directory
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding

@@ -26,12 +26,7 @@ from flowrec.core import (
 )
 from flowrec.physics import chip_from_files
 from flowrec.stages import ResolvedConfig, TrackQuality, calibration_of, config_from_toml, needed_packages
-from flowrec.store import (
-    FRAME_PATH,
-    Audit,
-    audit,
-    is_left_out,
-)
+from flowrec.store import FRAME_PATH, Audit, audit, is_left_out
 from flowrec.verbs.verdict import (
     CONSISTENT,
     DAMAGED,

@@ -7,22 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.core import (
-    Coverage,
-    Ended,
-    Outcome,
-    Role,
-    seconds,
-)
-from flowrec.store import (
-    UrlPath,
-    continuity_fault,
-    is_continued,
-    part_number,
-    part_path,
-    size_of,
-    verify_file,
-)
+from flowrec.core import Coverage, Ended, Outcome, Role, seconds
+from flowrec.store import UrlPath, continuity_fault, is_continued, part_number, part_path, size_of, verify_file
 from flowrec.verbs.check_file import EXACT, HEAD, NOT_EXACT, FileCheck
 from flowrec.verbs.verdict import CONSISTENT, DAMAGED, CheckFinding, Gap, Verdict
 

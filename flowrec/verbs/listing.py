@@ -13,25 +13,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flowrec.core import SessionError, UsageError, is_growing
-from flowrec.store import (
-    PARTIAL_SUFFIX,
-    SESSION_SUFFIX,
-    Session,
-    UrlPath,
-    part_number,
-    run_files,
-    run_path,
-)
+from flowrec.store import PARTIAL_SUFFIX, SESSION_SUFFIX, Session, UrlPath, part_number, run_files, run_path
 from flowrec.verbs.info import info
-from flowrec.verbs.listed import (
-    ALWAYS,
-    LISTS,
-    ListedSession,
-    columns_of,
-    kind_of,
-    text_of_list,
-    unknown_name,
-)
+from flowrec.verbs.listed import ALWAYS, LISTS, ListedSession, columns_of, kind_of, text_of_list, unknown_name
 
 _TOGETHER = 16  # sessions at URLs that are read at a time
 NAMES = (SESSION_SUFFIX, SESSION_SUFFIX + PARTIAL_SUFFIX)  # ends of the names of sessions, finished or not

@@ -48,14 +48,7 @@ from flowrec.run import (
     obey,
     run,
 )
-from flowrec.stages import (
-    MOVIE,
-    RIGS,
-    Config,
-    RunStatistics,
-    extra_rows,
-    shortest_way,
-)
+from flowrec.stages import MOVIE, RIGS, Config, RunStatistics, extra_rows, shortest_way
 from flowrec.store import SessionWriter, session_writer
 from flowrec.verbs.admission import admit, rehearse_aloud
 from flowrec.verbs.interactive import Unattended

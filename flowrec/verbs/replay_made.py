@@ -9,19 +9,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.core import (
-    FLOW_FIELDS,
-    MCAP,
-    RRD,
-    Output,
-    Phase,
-    Row,
-    SessionError,
-    UsageError,
-    progress,
-    say,
-    seconds,
-)
+from flowrec.core import FLOW_FIELDS, MCAP, RRD, Output, Phase, Row, SessionError, UsageError, progress, say, seconds
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, RunControl, RunReport, Sink, run
 from flowrec.stages import assemble, facts_of, other_packages

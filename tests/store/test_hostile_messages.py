@@ -25,15 +25,7 @@ from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.check import check
 from flowrec.verbs.cli import app
-from tests.store.drafts import (
-    ATTACHMENT,
-    CHANNEL,
-    METADATA,
-    PERIOD_NS,
-    TICKS,
-    made_up,
-    text,
-)
+from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, text
 from tests.store.hostile import (
     DRAFT,
     FRAMES,

@@ -19,16 +19,7 @@ from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.verbs.check import check
 from flowrec.verbs.cli import app
-from tests.store.drafts import (
-    CHANNEL,
-    CHUNK_INDEX,
-    MESSAGE,
-    METADATA,
-    SCHEMA,
-    TICKS,
-    record,
-    text,
-)
+from tests.store.drafts import CHANNEL, CHUNK_INDEX, MESSAGE, METADATA, SCHEMA, TICKS, record, text
 from tests.store.hostile import (
     _CHUNK_OPCODE,
     DRAFT,

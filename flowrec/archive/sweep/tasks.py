@@ -13,14 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flowrec.core import NUMERICS_VERSION, REPLAYED, SessionError, UsageError, __version__
-from flowrec.store import (
-    SESSION_SUFFIX,
-    Session,
-    UrlPath,
-    run_files,
-    session_path,
-    session_sha256,
-)
+from flowrec.store import SESSION_SUFFIX, Session, UrlPath, run_files, session_path, session_sha256
 from flowrec.verbs import read_each, runs_of
 
 if TYPE_CHECKING:

@@ -14,17 +14,7 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import (
-    NS_PER_S,
-    FlowField,
-    Image,
-    Priority,
-    RigError,
-    Truth,
-    nanoseconds,
-    realtime_priority,
-    seconds,
-)
+from flowrec.core import NS_PER_S, FlowField, Image, Priority, RigError, Truth, nanoseconds, realtime_priority, seconds
 from flowrec.rigs.emulated.coils import OutputSamples
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.rig import SimulatedRig

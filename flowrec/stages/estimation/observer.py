@@ -8,18 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import (
-    Alarm,
-    Applied,
-    Estimate,
-    FlowField,
-    Health,
-    Method,
-    Methods,
-    Share,
-    Track,
-    seconds,
-)
+from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Method, Methods, Share, Track, seconds
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import Kalman, corrects_map, memory_s
 from flowrec.stages.estimation.luenberger import Luenberger

@@ -21,14 +21,7 @@ import numpy as np
 
 from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, UsageError, seconds
 from flowrec.physics import Calibration, Chip, Robot
-from flowrec.stages.vision.disc_search import (
-    LARGEST,
-    Disc,
-    DiscSearch,
-    best_disc,
-    best_disc_normalised,
-    disc_pad_px,
-)
+from flowrec.stages.vision.disc_search import LARGEST, Disc, DiscSearch, best_disc, best_disc_normalised, disc_pad_px
 from flowrec.stages.vision.learned import (
     Candidates,
     ExpectedMotion,
