@@ -41,21 +41,15 @@ _BY_ALL = "by reading all of it"
 
 @dataclass(frozen=True, slots=True)
 class PushedFile:
-    """An object that holds a file, compared with it.
-
-    Attributes
-    ----------
-    sent_bytes : what was sent by this call; 0 if it was there already, less than `size_bytes` if it was resumed.
-    sha256 : of the file.
-    compared : how, in words: by reading back what was sent, all of it or, where the ETag of the store is that of the
-        content, some ranges; '' where these credentials may not read it.
-    """
+    """An object that holds a file, compared with it."""
 
     file: Path
     url: UrlPath
     size_bytes: int
-    sent_bytes: int
-    sha256: str
+    sent_bytes: int  # what was sent by this call; 0 if it was there already, less than `size_bytes` if it was resumed
+    sha256: str  # of the file
+    # how, in words: by reading back what was sent, all of it or, where the ETag of the store is that of the content,
+    # some ranges; '' where these credentials may not read it
     compared: str
 
     def __str__(self) -> str:

@@ -75,23 +75,14 @@ def coil_names(count: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class MessageField:
-    """One field of a message type.
-
-    Attributes
-    ----------
-    kind : int, float, bool, str, "vector" or "array".
-    optional : the field may be None.
-    dtype : of an array, else None.
-    shape : None where the declaration gives none, as for every plain number.
-    meaning : in words; that of its message type where the declaration has none.
-    """
+    """One field of a message type."""
 
     name: str
-    kind: Any
-    optional: bool
-    dtype: np.dtype[Any] | None
-    shape: Shape | None
-    meaning: str
+    kind: Any  # int, float, bool, str, "vector" or "array"
+    optional: bool  # the field may be None
+    dtype: np.dtype[Any] | None  # of an array, else None
+    shape: Shape | None  # None where the declaration gives none, as for every plain number
+    meaning: str  # in words; that of its message type where the declaration has none
 
     @property
     def is_float(self) -> bool:
@@ -325,18 +316,13 @@ class Source(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SlowStage:
-    """Dependencies of a result of the worker.
+    """Dependencies of a result of the worker."""
 
-    Attributes
-    ----------
-    orders : the work orders (`Mission.wanted`) that it answers, each with the settings that its computation reads
-        itself: sections of the configuration, or one setting of a section as `section.name`.
-    reads : fields of the ordering tick that are needed, besides its stamp and the mission.
-    settings : sections of the configuration on which it depends, besides those on which what it reads depends.
-    """
-
+    # the work orders (`Mission.wanted`) that it answers, each with the settings that its computation reads itself:
+    # sections of the configuration, or one setting of a section as `section.name`
     orders: Mapping[WorkOrder, tuple[str, ...]]
-    reads: tuple[str, ...]
+    reads: tuple[str, ...]  # fields of the ordering tick that are needed, besides its stamp and the mission
+    # sections of the configuration on which it depends, besides those on which what it reads depends
     settings: tuple[str, ...]
 
 

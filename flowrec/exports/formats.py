@@ -41,18 +41,12 @@ EXPORTS = Methods(
 
 
 class Exporter(Protocol):
-    """Interface of a row of EXPORTS.
+    """Interface of a row of EXPORTS."""
 
-    Attributes
-    ----------
-    suffixes : that the name of the output ends in, the usual one first; of a folder "" allows any name.
-    folder : the output is a folder; else one file.
-    advice : how to open the output, as words before its name.
-    """
-
+    # that the name of the output ends in, the usual one first; of a folder "" allows any name
     suffixes: tuple[str, ...]
-    folder: bool
-    advice: str
+    folder: bool  # the output is a folder; else one file
+    advice: str  # how to open the output, as words before its name
 
     def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         """Write a new file, or fill an empty folder, which gets its name when this returns.

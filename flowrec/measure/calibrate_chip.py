@@ -43,25 +43,16 @@ _SHOWN = {
 
 
 class PictureChip(NamedTuple):
-    """A chip of a picture.
-
-    Attributes
-    ----------
-    mask : (h, w) True in fluid.
-    pixel : size of a pixel of the mask, in pixels of the picture.
-    um_per_px : of the picture; None: not known.
-    openings : of the mask; which are inlets means nothing unless `inlets_known`.
-    speed_um_s : mean speed at the inlets; None: not known.
-    """
+    """A chip of a picture."""
 
     picture: SourcePicture
     found: Segmentation
-    mask: Mask
-    pixel: float
-    um_per_px: float | None
-    openings: tuple[Opening, ...]
+    mask: Mask  # (h, w) True in fluid
+    pixel: float  # size of a pixel of the mask, in pixels of the picture
+    um_per_px: float | None  # of the picture; None: not known
+    openings: tuple[Opening, ...]  # of the mask; which are inlets means nothing unless `inlets_known`
     inlets_known: bool
-    speed_um_s: float | None
+    speed_um_s: float | None  # mean speed at the inlets; None: not known
     wall_shift_um: float
     out: Path | None  # the TOML file, if it was written
 

@@ -194,15 +194,10 @@ def overlay(picture: Image, chip: Chip, calibration: Calibration) -> Colours:
 
 
 class ImageVerdict(NamedTuple):
-    """Result of the comparison of the axes with a picture.
+    """Result of the comparison of the axes with a picture."""
 
-    Attributes
-    ----------
-    contradiction : one line with the settings to paste; '' if there is none.
-    alike : the orientations in the image that it shows equally well; () if it does not show enough of the walls.
-    """
-
-    contradiction: str
+    contradiction: str  # one line with the settings to paste; '' if there is none
+    # the orientations in the image that it shows equally well; () if it does not show enough of the walls
     alike: tuple[Orientation, ...]
 
     @property

@@ -48,18 +48,11 @@ _LEAST_AREA, _MOST_AREA = 0.005, 0.75  # of the channel, relative to the picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segmentation:
-    """A channel.
+    """A channel."""
 
-    Attributes
-    ----------
-    outline : its walls, in pixels of the picture.
-    shown : how the walls show.
-    agreed : share of what looks like a wall that is a wall of this channel; 1 where fluid shows, not walls.
-    """
-
-    outline: Outline
-    shown: Shown
-    agreed: float
+    outline: Outline  # its walls, in pixels of the picture
+    shown: Shown  # how the walls show
+    agreed: float  # share of what looks like a wall that is a wall of this channel; 1 where fluid shows, not walls
 
     @property
     def quality(self) -> float:

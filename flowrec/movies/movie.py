@@ -49,17 +49,13 @@ class MovieFrame:
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """Options for reading a movie.
+    """Options for reading a movie."""
 
-    Attributes
-    ----------
-    channel : red, green, blue or grey (luma) of a movie in colour; None: a movie in colour is refused.
-    bits : depth of the pixels, where the file does not tell it; None: that of the file, or of its type.
-    partial : a movie that breaks off, or can not be decoded from some image on, ends there instead of being refused.
-    """
-
+    # red, green, blue or grey (luma) of a movie in colour; None: a movie in colour is refused
     channel: str | None = None
+    # depth of the pixels, where the file does not tell it; None: that of the file, or of its type
     bits: int | None = None
+    # a movie that breaks off, or can not be decoded from some image on, ends there instead of being refused
     partial: bool = False
 
 

@@ -41,34 +41,20 @@ class StoreError(SessionError):
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """Size and hashes of a file.
+    """Size and hashes of a file."""
 
-    Attributes
-    ----------
-    size : in bytes.
-    sha256 : of all bytes.
-    etag : that S3 gives to an object that was sent in parts of our size.
-    """
-
-    size: int
-    sha256: str
-    etag: str
+    size: int  # in bytes
+    sha256: str  # of all bytes
+    etag: str  # that S3 gives to an object that was sent in parts of our size
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A file that has become an object.
+    """A file that has become an object."""
 
-    Attributes
-    ----------
-    content : of the file.
-    sent_bytes : what was sent now; less than the size where an upload was resumed.
-    etag : that the store gave to the object.
-    """
-
-    content: Content
-    sent_bytes: int
-    etag: str
+    content: Content  # of the file
+    sent_bytes: int  # what was sent now; less than the size where an upload was resumed
+    etag: str  # that the store gave to the object
 
 
 class LocalParts:

@@ -34,20 +34,12 @@ _COUNTED = ("ticks", "dropped_frames", "frames_dropped")  # the last one in olde
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """Amount of a session that is kept, and what was lost.
+    """Amount of a session that is kept, and what was lost."""
 
-    Attributes
-    ----------
-    ticks : complete ticks without the keyframe of a part.
-    lost_bytes : of the old file, unusable.
-    lost : what was lost, as text; empty when nothing was.
-    outcome : of the recovered session.
-    """
-
-    ticks: int
-    lost_bytes: int
-    lost: str
-    outcome: dict[str, str]
+    ticks: int  # complete ticks without the keyframe of a part
+    lost_bytes: int  # of the old file, unusable
+    lost: str  # what was lost, as text; empty when nothing was
+    outcome: dict[str, str]  # of the recovered session
 
 
 class RecoveryTally:

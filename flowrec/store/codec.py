@@ -60,19 +60,12 @@ _OPERATOR_NAME = "operator."
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """Encoding of one message type.
+    """Encoding of one message type."""
 
-    Attributes
-    ----------
-    schema : protobuf schema of the payload.
-    encode : message -> parts of the payload, in order; large arrays are not copied.
-    decode : payload, MCAP sequence -> message.
-    has_unix_time : the schema is one of foxglove's, whose `timestamp` is Unix time; flowrec's own have stamps.
-    """
-
-    schema: Schema
-    encode: Callable[[Any], Payload]
-    decode: Callable[[bytes | memoryview, int], Any]
+    schema: Schema  # protobuf schema of the payload
+    encode: Callable[[Any], Payload]  # message -> parts of the payload, in order; large arrays are not copied
+    decode: Callable[[bytes | memoryview, int], Any]  # payload, MCAP sequence -> message
+    # the schema is one of foxglove's, whose `timestamp` is Unix time; flowrec's own have stamps
     has_unix_time: bool = False
 
 

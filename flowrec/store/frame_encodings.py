@@ -192,20 +192,12 @@ _WIDE_COST = 2.7  # time for a pixel of 16 bit relative to one of 8 bit
 
 @dataclass(frozen=True, slots=True)
 class FrameEncoding:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes
-    ----------
-    name : value of `recording.frames`.
-    compressed_chunks : whether the chunks are compressed.
-    lossless : whether the same pixels are read back.
-    bits : depth of the images.
-    """
-
-    name: str
-    compressed_chunks: bool
-    lossless: bool = True
-    bits: int = 8
+    name: str  # value of `recording.frames`
+    compressed_chunks: bool  # whether the chunks are compressed
+    lossless: bool = True  # whether the same pixels are read back
+    bits: int = 8  # depth of the images
 
     @property
     def codec(self) -> Codec:

@@ -27,16 +27,10 @@ _TAG_LIMIT = 60  # characters
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """One note; text and tags are as a person typed them.
+    """One note; text and tags are as a person typed them."""
 
-    Attributes
-    ----------
-    written : time in UTC, ISO 8601.
-    author : name of the user on that machine.
-    """
-
-    written: str
-    author: str
+    written: str  # time in UTC, ISO 8601
+    author: str  # name of the user on that machine
     text: str
     tags: tuple[str, ...] = ()
 

@@ -36,19 +36,12 @@ _NO_RANGE_TOLD = "can not be read: the server answers 206 without a range"
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The bytes of a range, and of which object.
-
-    Attributes
-    ----------
-    first : offset of the first byte.
-    size : of the whole object in bytes.
-    version : the server's word for this content, its ETag or the time of its last change; '' where it has none.
-    """
+    """The bytes of a range, and of which object."""
 
     data: bytes
-    first: int
-    size: int
-    version: str
+    first: int  # offset of the first byte
+    size: int  # of the whole object in bytes
+    version: str  # the server's word for this content, its ETag or the time of its last change; '' where it has none
 
     @property
     def end(self) -> int:
@@ -105,18 +98,11 @@ def requests_for(url: str, timeout_s: float) -> ObjectRequests:
 
 @dataclass(frozen=True, slots=True)
 class ListedObject:
-    """An object of a bucket.
+    """An object of a bucket."""
 
-    Attributes
-    ----------
-    name : after the folder that was listed.
-    size : in bytes.
-    version : as of an `Answer`.
-    """
-
-    name: str
-    size: int
-    version: str
+    name: str  # after the folder that was listed
+    size: int  # in bytes
+    version: str  # as of an `Answer`
 
 
 def listing(url: str, begin: str, timeout_s: float) -> list[ListedObject]:

@@ -52,21 +52,14 @@ class Part:
 
     Every file but the first starts with a keyframe: the full state at the last tick before it, at that tick's stamp.
     It makes the file readable alone; readers of the whole run skip it.
-
-    Attributes
-    ----------
-    run : the same random word in all files of a run.
-    number : from 1.
-    kind : "part" of a run that was split, or "snapshot", each of which is complete in itself.
-    keyframe_ns : stamp of the keyframe; None where the run itself begins. Its key in the file is `carried_ns`.
-    why : the event that a snapshot was taken for.
     """
 
-    run: str
-    number: int
-    kind: str = "part"
+    run: str  # the same random word in all files of a run
+    number: int  # from 1
+    kind: str = "part"  # "part" of a run that was split, or "snapshot", each of which is complete in itself
+    # stamp of the keyframe; None where the run itself begins. Its key in the file is `carried_ns`.
     keyframe_ns: int | None = None
-    why: str = ""
+    why: str = ""  # the event that a snapshot was taken for
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,18 +20,11 @@ _KEY = re.compile(r"with (\S+ key SHA256:\S+)")
 
 
 class Signature(NamedTuple):
-    """A signature that was verified.
+    """A signature that was verified."""
 
-    Attributes
-    ----------
-    key : kind and fingerprint of the key.
-    signer : as the list of signers names the key; '' without a list, or if the key is not in it.
-    fault : why the signature is not that of the file; '' if it is.
-    """
-
-    key: str = ""
-    signer: str = ""
-    fault: str = ""
+    key: str = ""  # kind and fingerprint of the key
+    signer: str = ""  # as the list of signers names the key; '' without a list, or if the key is not in it
+    fault: str = ""  # why the signature is not that of the file; '' if it is
 
 
 def signature_file(session: Path) -> Path:

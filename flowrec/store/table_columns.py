@@ -54,26 +54,15 @@ _READ_WITH_PIXELS = ("index", "image")  # of a Frame
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column.
+    """One column."""
 
-    Attributes
-    ----------
-    name : with the unit at its end.
-    field : of the message, "" for a column that every table has.
-    component : of a vector field, which this column holds; None: the whole field.
-    kind : int64, float64, float32, bool, string or timestamp: of its values, or of the elements of its lists.
-    shape : of the lists, a letter for a length that changes; () for single values.
-    unit : such as "um/s"; "" for pure numbers, texts, and where it is not the same for all elements.
-    meaning : in words.
-    """
-
-    name: str
-    field: str
-    component: int | None
-    kind: str
-    shape: tuple[int | str, ...]
-    unit: str
-    meaning: str
+    name: str  # with the unit at its end
+    field: str  # of the message, "" for a column that every table has
+    component: int | None  # of a vector field, which this column holds; None: the whole field
+    kind: str  # int64, float64, float32, bool, string or timestamp: of its values, or of the elements of its lists
+    shape: tuple[int | str, ...]  # of the lists, a letter for a length that changes; () for single values
+    unit: str  # such as "um/s"; "" for pure numbers, texts, and where it is not the same for all elements
+    meaning: str  # in words
 
 
 def columns_of(topic: str, topics: TopicTable = FIXED, coils: int = 3) -> tuple[Column, ...]:

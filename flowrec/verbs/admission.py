@@ -55,20 +55,12 @@ _POLL_S = 0.005
 
 
 class Held(NamedTuple):
-    """Rates that a trial has measured, in images a second.
+    """Rates that a trial has measured, in images a second."""
 
-    Attributes
-    ----------
-    asked_hz : rate of the camera.
-    ticks_hz : of the pipeline's ticks.
-    written_hz : of what reached the disk.
-    realtime : whether the loop had real-time priority.
-    """
-
-    asked_hz: float
-    ticks_hz: float
-    written_hz: float
-    realtime: bool = True
+    asked_hz: float  # rate of the camera
+    ticks_hz: float  # of the pipeline's ticks
+    written_hz: float  # of what reached the disk
+    realtime: bool = True  # whether the loop had real-time priority
 
     @property
     def hz(self) -> float:

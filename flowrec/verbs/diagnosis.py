@@ -70,18 +70,11 @@ _CAUSES = {
 
 
 class Finding(NamedTuple):
-    """One line.
+    """One line."""
 
-    Attributes
-    ----------
-    what : what was looked at.
-    level : ok, warning or failure.
-    text : what was found, with what to do unless it is ok.
-    """
-
-    what: str
-    level: str
-    text: str
+    what: str  # what was looked at
+    level: str  # ok, warning or failure
+    text: str  # what was found, with what to do unless it is ok
 
     @property
     def line(self) -> str:

@@ -34,18 +34,11 @@ _FIELDS = tuple(field.name for field in fields(Tick))
 
 
 class Batch(NamedTuple):
-    """Changes since the last batch.
+    """Changes since the last batch."""
 
-    Attributes
-    ----------
-    step : of the last tick's image only each `step`-th row and column is sent; the other ticks have no image.
-    changes : the fields of each tick that differ from the tick before.
-    remarks : what the run tells besides its ticks.
-    """
-
-    step: int
-    changes: list[dict[str, Any]]
-    remarks: dict[str, Any]
+    step: int  # of the last tick's image only each `step`-th row and column is sent; the other ticks have no image
+    changes: list[dict[str, Any]]  # the fields of each tick that differ from the tick before
+    remarks: dict[str, Any]  # what the run tells besides its ticks
 
 
 class Feed:

@@ -30,19 +30,13 @@ _IN_FLOW_ERROR = ("assumed_flow_error", "refined_flow_error")
 
 @dataclass(frozen=True, slots=True)
 class FoundSessions:
-    """Rows of a catalog that match an expression.
+    """Rows of a catalog that match an expression."""
 
-    Attributes
-    ----------
-    catalog : the file.
-    rows : values by column, of the session and, where the expression mentions them, of a replay or an event each.
-    mentioned : columns that the expression names.
-    """
-
-    catalog: Path
+    catalog: Path  # the file
     about: About
+    # values by column, of the session and, where the expression mentions them, of a replay or an event each
     rows: list[dict[str, Any]]
-    mentioned: list[str]
+    mentioned: list[str]  # columns that the expression names
 
     def paths(self) -> list[str]:
         """The sessions, each once, as they are named from this folder; `os.fsencode` makes the bytes of their names."""

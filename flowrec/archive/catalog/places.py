@@ -25,17 +25,11 @@ from flowrec.verbs import NAMES, runs_of
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A session, or a run with all its parts.
-
-    Attributes
-    ----------
-    files : its own, as `verbs.ls.runs_of` returns them.
-    signature : text that changes where size or time, at a URL the version, of a file or of its notes does.
-    """
+    """A session, or a run with all its parts."""
 
     path: Path
-    files: Sequence[Path]
-    signature: str
+    files: Sequence[Path]  # its own, as `verbs.ls.runs_of` returns them
+    signature: str  # text that changes where size or time, at a URL the version, of a file or of its notes does
 
 
 def contents_of(places: Iterable[Path], without: Path) -> tuple[list[Found], list[Path]]:

@@ -147,18 +147,12 @@ def content_of(session: Session) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Sessions:
-    """The sessions of a sweep.
+    """The sessions of a sweep."""
 
-    Attributes
-    ----------
-    by_content : one file for each content, by its hash.
-    left_out : lines of text about files that are not replayed: copies, replays, and what is no whole session.
-    unreadable : how many of those are no whole sessions.
-    """
-
-    by_content: dict[str, Path]
+    by_content: dict[str, Path]  # one file for each content, by its hash
+    # lines of text about files that are not replayed: copies, replays, and what is no whole session
     left_out: list[str]
-    unreadable: int
+    unreadable: int  # how many of those are no whole sessions
 
     @classmethod
     def of(cls, files: Sequence[Path], progress: Callable[[int], None] = lambda _: None) -> Sessions:

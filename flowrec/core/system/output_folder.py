@@ -29,20 +29,13 @@ class OutputFolder:
     An existing folder is replaced if it is an earlier output with the same `facts` in which nothing was changed; with
     `overwrite` if it is an output of flowrec at all. A folder with a file that flowrec did not write into it always
     stays as it is.
-
-    Attributes
-    ----------
-    path : of the folder.
-    facts : what it is made from; kept in its marker.
-    suffixes : that the name must end in, the usual one first; "" allows any name.
-    inputs : files that the command reads; the folder must contain none of them.
-    overwrite : a folder with other facts, or with files that were changed, may be replaced.
     """
 
-    path: Path
-    facts: Mapping[str, str]
-    suffixes: tuple[str, ...] = ("",)
-    inputs: tuple[Path, ...] = ()
+    path: Path  # of the folder
+    facts: Mapping[str, str]  # what it is made from; kept in its marker
+    suffixes: tuple[str, ...] = ("",)  # that the name must end in, the usual one first; "" allows any name
+    inputs: tuple[Path, ...] = ()  # files that the command reads; the folder must contain none of them
+    # a folder with other facts, or with files that were changed, may be replaced
     overwrite: bool = field(default=False)
 
     def check(self) -> None:

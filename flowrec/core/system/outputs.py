@@ -43,22 +43,14 @@ class OutputError(SessionError):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """An output file of a verb, and what it may replace.
+    """An output file of a verb, and what it may replace."""
 
-    Attributes
-    ----------
-    path : of the file.
-    suffixes : those of its format, the usual one first.
-    inputs : files that the command reads; the output must be none of them, even with `overwrite`.
-    overwrite : an existing file may be replaced.
-    replaces : SHA-256 of what flowrec wrote there before; a file that still holds it may be replaced, too.
-    """
-
-    path: Path
-    suffixes: tuple[str, ...]
+    path: Path  # of the file
+    suffixes: tuple[str, ...]  # those of its format, the usual one first
+    # files that the command reads; the output must be none of them, even with `overwrite`
     inputs: tuple[Path, ...] = ()
-    overwrite: bool = False
-    replaces: str = ""
+    overwrite: bool = False  # an existing file may be replaced
+    replaces: str = ""  # SHA-256 of what flowrec wrote there before; a file that still holds it may be replaced, too
 
     def check(self, also: Iterable[Path] = ()) -> None:
         """Check the output before any work is done for it.

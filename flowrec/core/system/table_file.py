@@ -37,22 +37,13 @@ _EXCEL_S, _EXCEL_S_PER_MB = 20.0, 20.0  # CPU time; openpyxl takes some 3 s for 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """A table; cells are text or, of an Excel file, numbers.
+    """A table; cells are text or, of an Excel file, numbers."""
 
-    Attributes
-    ----------
-    where : the file, for messages.
-    header : names of the columns, as written.
-    rows : cells of each row, as many as the header has.
-    lines : (n,) line of the file, or row of the sheet, of each row.
-    decimal_comma : numbers are written as 1,5.
-    """
-
-    where: str
-    header: tuple[str, ...]
-    rows: list[list[Any]]
-    lines: list[int]
-    decimal_comma: bool = False
+    where: str  # the file, for messages
+    header: tuple[str, ...]  # names of the columns, as written
+    rows: list[list[Any]]  # cells of each row, as many as the header has
+    lines: list[int]  # (n,) line of the file, or row of the sheet, of each row
+    decimal_comma: bool = False  # numbers are written as 1,5
 
     def index(self, name: str) -> int | None:
         """Place of a column by its name, or else by its name in another spelling; None: there is none.

@@ -46,18 +46,12 @@ _SHOWN = (  # fields of a tick, in the order in which they are taken
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """An event of the run, or an action of the operator.
-
-    Attributes
-    ----------
-    level : enums.Level of an event, '' of an action.
-    action : enums.Action of an action, '' of an event.
-    """
+    """An event of the run, or an action of the operator."""
 
     time_s: float
     text: str
-    level: str = ""
-    action: str = ""
+    level: str = ""  # enums.Level of an event, '' of an action
+    action: str = ""  # enums.Action of an action, '' of an event
 
 
 class History:

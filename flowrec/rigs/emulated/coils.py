@@ -33,18 +33,11 @@ _SAID = 300  # letters of what a compiler prints
 
 @dataclass(frozen=True)
 class OutputSamples:
-    """A file of samples of the outputs, which grows.
+    """A file of samples of the outputs, which grows."""
 
-    Attributes
-    ----------
-    file : records of `sample`, one for each change of the outputs.
-    a_per_unit : current of a coil in A for one unit in the file.
-    coils : their number.
-    """
-
-    file: Path
-    a_per_unit: float = FULL_A
-    coils: int = 3
+    file: Path  # records of `sample`, one for each change of the outputs
+    a_per_unit: float = FULL_A  # current of a coil in A for one unit in the file
+    coils: int = 3  # their number
 
     @property
     def sample_bytes(self) -> int:

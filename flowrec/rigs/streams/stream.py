@@ -23,40 +23,24 @@ class NoStreamError(RigError):
 
 @dataclass(frozen=True, slots=True)
 class StreamHead:
-    """Properties that a sender states.
+    """Properties that a sender states."""
 
-    Attributes
-    ----------
-    channels : names of the channels.
-    units : of each channel, '' where it is not stated.
-    rate_hz : of a regular stream; 0: samples come when they come.
-    sender : who sends, for people: program, machine.
-    """
-
-    channels: tuple[str, ...]
-    units: tuple[str, ...]
-    rate_hz: float = 0.0
-    sender: str = ""
+    channels: tuple[str, ...]  # names of the channels
+    units: tuple[str, ...]  # of each channel, '' where it is not stated
+    rate_hz: float = 0.0  # of a regular stream; 0: samples come when they come
+    sender: str = ""  # who sends, for people: program, machine
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Samples that came together.
+    """Samples that came together."""
 
-    Attributes
-    ----------
-    times_ns : (n,) when each was taken, on the host's monotonic clock; of a simulated stream on the session clock.
-    values : (n, c) all channels of each sample; or (n,) one value each, of the channels in `channel`.
-    arrival_ns : when they had come, on the same clock.
-    channel : (n,) places in `StreamHead.channels`, where `values` is (n,).
-    head : the head, if it has changed.
-    """
-
+    # (n,) when each was taken, on the host's monotonic clock; of a simulated stream on the session clock
     times_ns: Ints
-    values: Floats
-    arrival_ns: int
-    channel: NDArray[np.int32] | None = None
-    head: StreamHead | None = None
+    values: Floats  # (n, c) all channels of each sample; or (n,) one value each, of the channels in `channel`
+    arrival_ns: int  # when they had come, on the same clock
+    channel: NDArray[np.int32] | None = None  # (n,) places in `StreamHead.channels`, where `values` is (n,)
+    head: StreamHead | None = None  # the head, if it has changed
 
 
 class SampleStream(Protocol):
