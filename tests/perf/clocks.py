@@ -28,21 +28,14 @@ _EPOCH = 1_234_567_890_123
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Frames as they arrive.
-
-    Attributes
-    ----------
-    true_ns : (n,) when each was taken and could have been here at the earliest, ns on the host's clock.
-    device : counts of the camera's clock, n of them.
-    arrival_ns : n, in the order of arrival.
-    events_s : when something went wrong that a new fit has to be begun for.
-    """
+    """Frames as they arrive."""
 
     name: str
+    # (n,) when each was taken and could have been here at the earliest, ns on the host's clock
     true_ns: NDArray[np.int64]
-    device: list[int]
-    arrival_ns: list[int]
-    events_s: tuple[float, ...] = ()
+    device: list[int]  # counts of the camera's clock, n of them
+    arrival_ns: list[int]  # n, in the order of arrival
+    events_s: tuple[float, ...] = ()  # when something went wrong that a new fit has to be begun for
 
 
 def series(name: str, seconds: float = 300.0, seed: int = 0) -> Series:
