@@ -128,10 +128,8 @@ class WindingProposal(NamedTuple):
 def windings_matrix(texts: Sequence[str], out: Path | None = None, overwrite: bool = False) -> WindingProposal:
     """The matrix coils.mt_per_a of windings, a column each in their order; written to `out` if it is given.
 
-    Raises
-    ------
-    UsageError : a text that is no winding, or windings that can not make every field, in one line.
-    OutputError : `out` may not be written, see `Output.check`.
+    Raises UsageError: a text that is no winding, or windings that can not make every field, in one line; OutputError:
+    `out` may not be written, see `Output.check`.
     """
     outputs = check_outputs(out, (), overwrite)
     proposal = WindingProposal(tuple(map(winding_of, texts)), out)

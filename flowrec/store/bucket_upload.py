@@ -121,10 +121,8 @@ def content_of_file(path: Path, progress: Callable[[int], None] = lambda _: None
 class Bucket:
     """A folder in a bucket of S3 that files are sent to; credentials and endpoint come from the environment.
 
-    Raises
-    ------
-    UsageError : the extra `remote` is not installed.
-    StoreError : from any method: the bucket can not be written, in one line.
+    Raises UsageError: the extra `remote` is not installed; StoreError: from any method: the bucket can not be written,
+    in one line.
     """
 
     def __init__(self, folder: UrlPath) -> None:

@@ -53,10 +53,7 @@ def read_notes(session: Path, key: str) -> list[Note]:
 def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
     """Write one note behind the others, and onto the disk.
 
-    Raises
-    ------
-    UsageError : there is neither text nor tag, or one is too long.
-    SessionError : the file can not be written.
+    Raises UsageError: there is neither text nor tag, or one is too long; SessionError: the file can not be written.
     """
     tags = tuple(dict.fromkeys(tag.strip() for tag in tags))
     if not text.strip() and not tags:

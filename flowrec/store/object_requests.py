@@ -83,10 +83,8 @@ class ObjectRequests(ABC):
 def requests_for(url: str, timeout_s: float) -> ObjectRequests:
     """The requests for the object at a URL.
 
-    Raises
-    ------
-    UsageError : the packages of the extra `remote` are not installed, or the URL names a bucket or host alone.
-    SessionError : the URL can not name an object.
+    Raises UsageError: the packages of the extra `remote` are not installed, or the URL names a bucket or host alone;
+    SessionError: the URL can not name an object.
     """
     if not url.partition("://")[2].partition("/")[2]:
         raise UsageError(f"{url}: names no object; name a session in it, as in {url.rstrip('/')}/run.mcap")

@@ -126,10 +126,8 @@ def _match_name(path: Path) -> tuple[Path, re.Match[str] | None]:
 def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
     """Refuse the output X.mcap as `Output.check` does, and any file of that run, finished or not, in the same way.
 
-    Raises
-    ------
-    OutputError : as `Output.check`.
-    SessionError : the unfinished file of a killed run is there, which `overwrite` would remove.
+    Raises OutputError: as `Output.check`; SessionError: the unfinished file of a killed run is there, which `overwrite`
+    would remove.
     """
     there = run_files(path)
     Output(path, MCAP, tuple(inputs), overwrite).check((*there, partial_path(path)))

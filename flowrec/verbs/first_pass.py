@@ -89,17 +89,14 @@ class Looked(NamedTuple):
 def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Looked:
     """Look through the movie once; the robot is tracked if there is a log to compare with.
 
+    Raises UsageError: several bodies qualify, or the given one is not there; FlowrecError: as `import_movie`.
+
     Parameters
     ----------
     looked_at : the same configuration with the log where it overlaps the movie.
     robot : which body is the robot: a number of the picture, "X,Ypx" in pixels of the first image, or "X,Y" in um on
         the chip; '': the only one that qualifies, or the one of tracker.click_px or box_px.
     folder : for the picture of the candidates.
-
-    Raises
-    ------
-    UsageError : several bodies qualify, or the given one is not there.
-    FlowrecError : as `import_movie`.
     """
     marked = asked.tracker.click_px is not None or asked.tracker.box_px is not None
     if robot and marked:

@@ -152,10 +152,7 @@ def open_viewer(path: Path | str) -> str:
 def serve_recordings(recordings: Sequence[Path], port: int | None = None) -> Iterator[str]:
     """Serve recordings as a dataset for as long as the block runs; yields the URL for Rerun and its clients.
 
-    Raises
-    ------
-    UsageError : the server's packages are not installed.
-    FlowrecError : the server does not start.
+    Raises UsageError: the server's packages are not installed; FlowrecError: the server does not start.
     """
     if importlib.util.find_spec("datafusion") is None:
         raise UsageError("--serve needs Rerun's catalog, which is not installed: pip install 'flowrec[catalog]'")

@@ -35,12 +35,8 @@ class Found:
 def contents_of(places: Iterable[Path], without: Path) -> tuple[list[Found], list[Path]]:
     """List the sessions in folders, and those that are named, in order of name; and tables that may be of sweeps.
 
-    `without`: the catalog itself.
-
-    Raises
-    ------
-    SessionError : a place is not there, or can not be listed.
-    UsageError : a place is neither a folder nor a session.
+    `without`: the catalog itself. Raises SessionError: a place is not there, or can not be listed; UsageError: a place
+    is neither a folder nor a session.
     """
     marks: dict[Path, str] = {}
     for place in places:

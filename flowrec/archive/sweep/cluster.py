@@ -39,15 +39,13 @@ _COMPARED = ("distributed", "dask")
 def workers_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     """A client of Dask.
 
+    Raises UsageError: the address can not be one; FlowrecError: no scheduler answers there, or it is of another
+    version.
+
     Parameters
     ----------
     scheduler : address of a scheduler, such as tcp://10.0.0.1:8786; None: workers of this machine, on 127.0.0.1.
     workers : how many of this machine; None: one for each core.
-
-    Raises
-    ------
-    UsageError : the address can not be one.
-    FlowrecError : no scheduler answers there, or it is of another version.
     """
     with ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())

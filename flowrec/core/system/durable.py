@@ -67,12 +67,7 @@ def replacing(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
 
     If the block ends with an exception, the new file is removed and `path` is as it was before. Files that killed
     processes have left in the folder are removed, too. `overwrite`: a file of that name may be replaced, whatever it
-    holds.
-
-    Raises
-    ------
-    FileExistsError : there is one, and `overwrite` is not set.
-    OSError : it can not be written.
+    holds. Raises FileExistsError: there is one, and `overwrite` is not set; OSError: it can not be written.
     """
     part = path.with_name(temporary_name(path.suffix))
     remove_leftovers_once(part.absolute().parent)
@@ -95,10 +90,8 @@ def write_all(descriptor: int, data: bytes) -> None:
 def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:
     """Rename a finished file to its final name in one step, and flush the name to the disk.
 
-    Raises
-    ------
-    FileExistsError : another file has the name by now, and `overwrite` is not set.
-    OSError : the name can not be given.
+    Raises FileExistsError: another file has the name by now, and `overwrite` is not set; OSError: the name can not be
+    given.
     """
     if overwrite:
         part.replace(path)

@@ -64,10 +64,7 @@ def open_new(path: Path, *, overwrite: bool = False) -> FileIO:
 def remove_idle(path: Path) -> None:
     """Remove a file, unless a living process writes it.
 
-    Raises
-    ------
-    BlockingIOError : a living process writes it.
-    OSError : it can not be opened, locked or removed.
+    Raises BlockingIOError: a living process writes it; OSError: it can not be opened, locked or removed.
     """
     try:
         file = FileIO(path, "r+")

@@ -60,12 +60,8 @@ class OutputFolder:
     def new_folder(self) -> Iterator[Path]:
         """Yield a temporary empty folder beside `path`; it gets that name when the block ends without an exception.
 
-        If the block ends with an exception, nothing is left and an existing folder is as before.
-
-        Raises
-        ------
-        OutputError : the output is refused, see `check`.
-        SessionError : it can not be written, in one line.
+        If the block ends with an exception, nothing is left and an existing folder is as before. Raises OutputError:
+        the output is refused, see `check`; SessionError: it can not be written, in one line.
         """
         self.check()
         path = self.path.absolute()

@@ -85,12 +85,8 @@ class Output:
     def new_file(self) -> Iterator[Path]:
         """Yield a temporary file in the same folder; it gets the name `path` when the block ends without an exception.
 
-        If the block ends with an exception, nothing is left.
-
-        Raises
-        ------
-        OutputError : the output is refused, see `check`.
-        SessionError : it can not be written, in one line.
+        If the block ends with an exception, nothing is left. Raises OutputError: the output is refused, see `check`;
+        SessionError: it can not be written, in one line.
         """
         self.check()
         path = self.path
