@@ -10,13 +10,12 @@ of the intervals. Slope: time of the host per time of the camera's clock.
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,12 +34,12 @@ from flowrec.rigs.lab.cameras.mmcore import MmcoreCamera
 from flowrec.rigs.lab.cameras.pylon import PylonCamera
 from flowrec.store.session import Session
 from tests.perf.camera_killed import trial
+from tests.perf.guardian import busy
 from tests.rigs.lab.cameras.watching import adds_up
 from tests.twins.emulator import emulated, showing
 from tests.twins.gige import Aravis, port
 
 WANTED = Wanted(width_px=512, height_px=512, rate_hz=60.0, exposure_s=0.004)
-_BURN = "while True: pass"
 
 
 class WatchedGenicam(GenicamCamera):
@@ -88,18 +87,6 @@ def figures(grabber: Grabber, frames: list[Captured], agree: str = "") -> Result
         "arrival_max_ms": float(intervals_ms.max()),
         "slope": envelope(points)[1] * ticks_per_s / NS_PER_S if len(points) > 1 and ticks_per_s else 0.0,
     }
-
-
-@contextmanager
-def busy(processes: int) -> Iterator[None]:
-    """Other processes that never wait."""
-    burning = [subprocess.Popen([sys.executable, "-c", _BURN]) for _ in range(processes)]
-    try:
-        yield
-    finally:
-        for process in burning:
-            process.kill()
-            process.wait()
 
 
 def aravis(
