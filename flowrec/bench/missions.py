@@ -194,10 +194,7 @@ def measure(
         for policy in names
     ]
     rows: list[Row] = []
-    with (
-        progress("flying", len(missions), "missions") as done,
-        pool(jobs) as workers,
-    ):
+    with progress("flying", len(missions), "missions") as done, pool(jobs) as workers:
         columns = zip(*missions, strict=True)
         for row in workers.map(fly, *columns, chunksize=4) if jobs > 1 else map(fly, *columns):
             rows.append(row)

@@ -207,11 +207,7 @@ def sampled_s(log: FieldLog, image_s: float) -> float | None:
 
 
 def fit_samples(
-    stamps_ns: Ints,
-    positions_um: Floats,
-    log: FieldLog,
-    within: SearchRange,
-    flow: FlowField | None = None,
+    stamps_ns: Ints, positions_um: Floats, log: FieldLog, within: SearchRange, flow: FlowField | None = None
 ) -> MotionFit | None:
     """The fit to a log whose rows are samples of a field that changes between them; None: they are not, or too few.
 

@@ -92,10 +92,7 @@ class Audit:
 
 
 def audit(
-    path: Path,
-    see: See,
-    progress: Callable[[int], None] | None = None,
-    begin: Callable[[Audit], None] | None = None,
+    path: Path, see: See, progress: Callable[[int], None] | None = None, begin: Callable[[Audit], None] | None = None
 ) -> Audit:
     """Read everything that can be read, in file order; one chunk is in memory at a time.
 

@@ -207,11 +207,7 @@ def _chunk_head(chunk: SealedChunk) -> bytes:
     """A chunk record up to its data, which would be copied twice by mcap's own builder."""
     name = chunk.compression.encode()
     head = CHUNK_HEAD.pack(
-        chunk.message_start_time,
-        chunk.message_end_time,
-        chunk.uncompressed_size,
-        chunk.uncompressed_crc,
-        len(name),
+        chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size, chunk.uncompressed_crc, len(name)
     )
     head += name + LONG.pack(len(chunk.data))
     return RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(chunk.data)) + head

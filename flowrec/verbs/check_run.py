@@ -101,10 +101,7 @@ def _check_run(path: Path, checks: Sequence[FileCheck]) -> Verdict:
     _check_continuity(run, checks)
     if last.finished and is_continued(last.outcome):
         following = part_path(path, part_number(last.path) + 1).name
-        run.bad(
-            "end",
-            f"the run continues in {following}, which is missing; `flowrec recover {path}` ends it there",
-        )
+        run.bad("end", f"the run continues in {following}, which is missing; `flowrec recover {path}` ends it there")
     known = {name: topic.path for check in checks for name, topic in check.found.topics.by_field.items()}
     run.topics = {known[name]: count for name, count in counts.items() if count}
     ticks, size_bytes = sum(check.tally.ticks for check in checks), sum(check.found.size_bytes for check in checks)

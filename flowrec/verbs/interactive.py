@@ -117,12 +117,7 @@ class StatusLine:
     note : the note that a person is typing; None without one.
     """
 
-    def __init__(
-        self,
-        file_bytes: Callable[[], int],
-        disk: Callable[[], str],
-        note: Callable[[], str | None],
-    ) -> None:
+    def __init__(self, file_bytes: Callable[[], int], disk: Callable[[], str], note: Callable[[], str | None]) -> None:
         self._file_bytes = file_bytes
         self._disk = disk
         self._note = note

@@ -39,10 +39,7 @@ def screenshot(
     path = Path(path).resolve()
     if not path.exists():
         raise FlowrecError(f"{path}: no such file")
-    with (
-        Output(Path(out_png), PICTURE, (path,), overwrite).new_file() as part,
-        _headless(size) as (client, began),
-    ):
+    with Output(Path(out_png), PICTURE, (path,), overwrite).new_file() as part, _headless(size) as (client, began):
         client.open(path.as_uri())
         state = viewer.until(lambda: _wait_loaded(client), _LOAD_S)
         if state is None:

@@ -137,10 +137,7 @@ def two_aravis(duration_s: float) -> Results:
     return (
         rows[0]
         | {key: rows[0][key] + rows[1][key] for key in sums}
-        | {
-            "adds_up": rows[0]["adds_up"] and rows[1]["adds_up"],
-            "hz": min(row["hz"] for row in rows),
-        }
+        | {"adds_up": rows[0]["adds_up"] and rows[1]["adds_up"], "hz": min(row["hz"] for row in rows)}
     )
 
 

@@ -145,10 +145,7 @@ def said_of(fit: Fit) -> str:
     return ", ".join([f"unit {fit.unit:.3g}" for _ in range(fit.unit > 0.0)] + parts)
 
 
-METHODS: dict[str, Callable[[Series], tuple[NDArray[np.float64], str]]] = {
-    "arrival": _arrival,
-    "flowrec": _ours,
-}
+METHODS: dict[str, Callable[[Series], tuple[NDArray[np.float64], str]]] = {"arrival": _arrival, "flowrec": _ours}
 
 
 def show(figures: dict[str, Any]) -> None:

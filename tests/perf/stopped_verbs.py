@@ -58,9 +58,7 @@ VERBS = {
     "verify, 2 jobs": Verb("replay {a} --verify --jobs 2", "flowrec.verbs.replay_segments"),
     "refine": Verb("replay {a} --refine gain -o {out}/r.mcap", "flowrec.verbs.replay_made", ("r.mcap",)),
     "refly": Verb(
-        "replay {a} --refine gain --refly -o {out}/r.mcap",
-        "flowrec.verbs.replay_made",
-        ("r.mcap", "r_refly.mcap"),
+        "replay {a} --refine gain --refly -o {out}/r.mcap", "flowrec.verbs.replay_made", ("r.mcap", "r_refly.mcap")
     ),
     "check": Verb("check {a}", "flowrec.verbs.check_run"),
     "compare": Verb("compare {a} {b}", "flowrec.verbs.session_comparison"),
@@ -242,12 +240,7 @@ def _sessions(session: Path, folder: Path) -> dict[str, str]:
 
 
 def _rows(
-    title: str,
-    verb: Verb,
-    sessions: dict[str, str],
-    folder: Path,
-    imports: Sequence[float],
-    shares: Sequence[float],
+    title: str, verb: Verb, sessions: dict[str, str], folder: Path, imports: Sequence[float], shares: Sequence[float]
 ) -> Iterator[dict[str, Any]]:
     def words(out: Path) -> list[str]:
         out.mkdir()

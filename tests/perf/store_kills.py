@@ -214,11 +214,7 @@ def _row(kind: Kind, found: _Found) -> dict[str, Any]:
 def _spread(lost_s: list[float]) -> dict[str, float]:
     if not lost_s:
         return dict.fromkeys(("median", "p99", "max"), float("nan"))
-    return {
-        "median": float(np.median(lost_s)),
-        "p99": float(np.percentile(lost_s, 99)),
-        "max": max(lost_s),
-    }
+    return {"median": float(np.median(lost_s)), "p99": float(np.percentile(lost_s, 99)), "max": max(lost_s)}
 
 
 def _record(kind: Kind, path: Path, images: list[Image], handed: mmap.mmap) -> None:

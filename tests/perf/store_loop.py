@@ -128,10 +128,7 @@ def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -
         path = Path(name) / "soak.mcap"
         pieces = Snapshot(_RING_S) if keeping else Split()
         options = WriterOptions(frames="delta", files=pieces, own_process=True)
-        with (
-            SessionWriter(path, made_up_header(), options) as writer,
-            progress("soaking", count) as done,
-        ):
+        with SessionWriter(path, made_up_header(), options) as writer, progress("soaking", count) as done:
             began = time.perf_counter()
             mark: OperatorEvent | None = None
             for number, tick in enumerate(ticks_of(images, count, _SOAK_RATE_HZ)):

@@ -63,8 +63,7 @@ def test_a_million_empty_messages_are_not_made(tmp_path):
     tiny = record(MESSAGE, struct.pack("<HIQQ", STATE, 0, 10**9, 10**9)) * 140_000
     packed = zstandard.compress(tiny)
     path = file_of(
-        tmp_path,
-        with_piece(STATE, lambda p: replace(p, packed=packed, told_size=len(tiny), told_crc=zlib.crc32(tiny))),
+        tmp_path, with_piece(STATE, lambda p: replace(p, packed=packed, told_size=len(tiny), told_crc=zlib.crc32(tiny)))
     )
     refused(path, "more than 131072 messages in one chunk")
 

@@ -175,10 +175,7 @@ def test_what_is_in_one_session_only_is_one_line_a_topic(tmp_path: Path, ticks: 
     status, said = run("compare", first, second, "--json")
     found = json.loads(said)
     assert status == 3 and not found["same"]
-    assert found["apart"] == {
-        "/truth/robot": "only in a.mcap, 20 messages",
-        "/truth/flow": "only in a.mcap, 1 message",
-    }
+    assert found["apart"] == {"/truth/robot": "only in a.mcap, 20 messages", "/truth/flow": "only in a.mcap, 1 message"}
     assert found["head"]["configuration"].keys() == {"recording.leave_out"}
     status, said = run("compare", first, second, "--ignore", "truth", "--ignore", "configuration.recording")
     assert status == 0, said

@@ -86,10 +86,7 @@ def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_pat
         assert rows["x.mcap.partial"]["outcome"] == "recording"  # other runs of this machine may stand beside it
         words = [sys.executable, "-m", "flowrec", "view", path, "--live", "--console", "--no-open"]
         control = RunControl()
-        with (
-            CommandSocket(path, control, print),
-            subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as view,
-        ):
+        with CommandSocket(path, control, print), subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as view:
             assert view.stderr is not None
             told = [view.stderr.readline() for _ in range(4)]
             assert "rerun --connect" in told[0] and "Ctrl-C ends the view" in told[3]

@@ -392,11 +392,7 @@ def test_two_sessions_of_one_name_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("sent", "told"),
-    [
-        (3_000_000, "3.0 MB sent, compared"),
-        (1_000_000, "3.0 MB sent, 1.0 MB of them now, c"),
-        (0, "is there already"),
-    ],
+    [(3_000_000, "3.0 MB sent, compared"), (1_000_000, "3.0 MB sent, 1.0 MB of them now, c"), (0, "is there already")],
 )
 def test_what_was_sent_by_an_earlier_call_is_told_apart(tmp_path: Path, sent: int, told: str) -> None:
     file = PushedFile(tmp_path / "a.mcap", UrlPath("s3://lab/a.mcap"), 3_000_000, sent, "", "by reading all of it")

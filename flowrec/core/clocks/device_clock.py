@@ -157,9 +157,7 @@ def _advance(fit: Fit, device: int, point: Point) -> Fit:
             if judged is not None:
                 return judged
             fit = replace(
-                fit,
-                first_points=(point,),
-                suspected_unit=(early[-1][1] - early[0][1]) / (early[-1][0] - early[0][0]),
+                fit, first_points=(point,), suspected_unit=(early[-1][1] - early[0][1]) / (early[-1][0] - early[0][0])
             )
         if early_ns > nanoseconds(_EARLY_S):
             # The clock seems to count faster than stated; wait for the measurement.

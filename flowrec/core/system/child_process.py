@@ -47,11 +47,7 @@ class ChildProcess:
     """
 
     def __init__(
-        self,
-        module: str,
-        *words: str,
-        environment: Mapping[str, str] | None = None,
-        inherited: Sequence[int] = (),
+        self, module: str, *words: str, environment: Mapping[str, str] | None = None, inherited: Sequence[int] = ()
     ) -> None:
         self.process = start_child(module, *words, environment=environment, stderr=subprocess.PIPE, pass_fds=inherited)
         self.printed = b""

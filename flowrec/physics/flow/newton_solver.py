@@ -192,13 +192,7 @@ class System(Equations):
         )
 
     def _newton(
-        self,
-        flux: Floats,
-        drive: Floats,
-        push: Floats | float,
-        inertia: float,
-        max_iterations: int,
-        tolerance: float,
+        self, flux: Floats, drive: Floats, push: Floats | float, inertia: float, max_iterations: int, tolerance: float
     ) -> tuple[Floats | None, int, float]:
         """Flux, or None where the iteration diverges or is slow; number of iterations; last relative step.
 

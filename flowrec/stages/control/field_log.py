@@ -126,11 +126,7 @@ class FieldLog:
         self._rows = n + 1
 
     def extend(
-        self,
-        stamp_ns: int,
-        segments: Iterable[MotionSegment],
-        amplitude_mt: float,
-        currents_a: ArrayLike | None = None,
+        self, stamp_ns: int, segments: Iterable[MotionSegment], amplitude_mt: float, currents_a: ArrayLike | None = None
     ) -> int:
         """Append the segments of a motion of the field, from a stamp on. Returns the stamp of their end."""
         for each in segments:

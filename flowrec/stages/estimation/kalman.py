@@ -69,12 +69,7 @@ class Kalman:
     estimate_gain: bool = False
 
     def estimate(
-        self,
-        previous: Estimate | None,
-        track: Track,
-        applied: Applied,
-        robot: Robot,
-        field: FlowField | None = None,
+        self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot, field: FlowField | None = None
     ) -> Estimate:
         """One prediction and, where the robot was seen, one update; with a `field`, the map model.
 

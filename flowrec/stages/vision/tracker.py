@@ -342,10 +342,7 @@ class Tracker:
         neighbours = np.concatenate([neighbours_of(found, which), covered.ravel()])
         isolated = is_isolated(neighbours, to_px, radius_px)
         track = replace(
-            seen,
-            position_um=calibration.to_um(to_px),
-            score=min(max(score, 0.01), 1.0),
-            neighbours_px=neighbours,
+            seen, position_um=calibration.to_um(to_px), score=min(max(score, 0.01), 1.0), neighbours_px=neighbours
         )
         if not len(covered):
             track = with_motion(track, motion, to_px, float(found.energy[which]))
