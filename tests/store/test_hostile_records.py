@@ -12,13 +12,12 @@ from dataclasses import replace
 import pytest
 import zstandard
 from mcap.records import Schema
-from typer.testing import CliRunner
 
 from flowrec.core.errors import SessionError
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.verbs.check import check
-from flowrec.verbs.cli import app
+from tests.conftest import invoke
 from tests.store.drafts import CHANNEL, CHUNK_INDEX, MESSAGE, METADATA, SCHEMA, TICKS, record, text
 from tests.store.hostile import (
     _CHUNK_OPCODE,
@@ -154,7 +153,7 @@ def with_session(**said):
 def test_a_version_of_thousands_of_digits_is_cut_and_does_not_hide_the_other_sessions(tmp_path):
     path = file_of(tmp_path, with_session(format_version="9" * 5000, flowrec_version="8" * 5000))
     refused(path, "is a session of format '9999.*install flowrec 8888")
-    done = CliRunner().invoke(app, ["ls", str(tmp_path), "--json"])
+    done = invoke("ls", tmp_path, "--json")
     assert done.exit_code == 0 and len(done.stdout) < 1000 and "of format" in done.stdout
 
 

@@ -10,7 +10,6 @@ import threading
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 from websockets.sync.client import connect
 
 from flowrec.core.errors import SessionError, UsageError
@@ -20,16 +19,11 @@ from flowrec.store.notes import notes_file
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import app
 from flowrec.verbs.listing import read_each
 from flowrec.verbs.ls import ls
 from flowrec.verbs.view import view as view_session
-from tests.conftest import HANG_S
+from tests.conftest import HANG_S, typed
 from tests.store.made_up import HEADER, ticks_of
-
-
-def typed(*words: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
 
 
 def write(path: Path, count: int, **figures: float) -> Path:

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.stages import robot_topic
-from flowrec.verbs.cli import app
 from flowrec.verbs.compare import compare
+from tests.conftest import answered
 from tests.rewritten import leaves_of, rewrite
 from tests.short_missions import SMALL
 
@@ -22,15 +21,9 @@ SEVERAL = [*SMALL, "simulated.robots=3", "tracker.robots=3", "simulated.seed=4"]
 COMPUTED = [robot_topic(path, number) for path in ("/robot/track", "/robot/estimate") for number in (1, 2)]
 
 
-def run(*words: object) -> tuple[int, str]:
-    """Exit status and what was printed."""
-    done = CliRunner().invoke(app, [str(word) for word in words])
-    return done.exit_code, done.output
-
-
 def recorded(path: Path, *sets: str) -> Path:
     chosen = [word for each in (*SEVERAL, *sets) for word in ("--set", each)]
-    status, said = run("record", *chosen, "--duration", 2, "--out", path)
+    status, said = answered("record", *chosen, "--duration", 2, "--out", path)
     assert status == 0, said
     return path
 
@@ -41,7 +34,7 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def verified(path: Path, *more: object) -> tuple[int, dict[str, Any]]:
-    status, said = run("replay", path, "--verify", "--json", *more)
+    status, said = answered("replay", path, "--verify", "--json", *more)
     return status, json.loads(said)
 
 
@@ -51,7 +44,7 @@ def test_a_replay_computes_all_robots_again_also_from_the_middle(mission: Path, 
     assert status == 0 and found["same"] is not False
     for path in (*COMPUTED, "/robots/walls"):
         assert found["topics"][path]["identical"] > 30 and not found["topics"][path]["different"], path
-    assert run("check", mission)[0] == 0
+    assert answered("check", mission)[0] == 0
 
 
 @pytest.mark.parametrize("path", [*COMPUTED[1:3], "/robots/walls"])
@@ -94,14 +87,16 @@ def test_a_comparison_tells_which_robot_differs(mission: Path, tmp_path: Path) -
 
 
 def test_the_first_robot_may_be_replayed_alone(mission: Path) -> None:
-    status, said = run("replay", mission, "--set", "tracker.robots=1", "--json", "--out", mission.with_name("one.mcap"))
+    status, said = answered(
+        "replay", mission, "--set", "tracker.robots=1", "--json", "--out", mission.with_name("one.mcap")
+    )
     assert status == 0, said
     session = flowrec.open(mission.with_name("one.mcap"))
     assert session.topics["/robot/track"] > 30 and "/robot/1/track" not in session.topics
 
 
 def test_tables_have_one_for_each_robot_and_its_truth(mission: Path, tmp_path: Path) -> None:
-    status, said = run("export", mission, tmp_path / "tables", "--format", "parquet")
+    status, said = answered("export", mission, tmp_path / "tables", "--format", "parquet")
     assert status == 0, said
     for number in (1, 2):
         track, truth = (
