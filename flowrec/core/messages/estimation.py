@@ -123,7 +123,9 @@ class Observations(Message):
         None
     )
     tracer: Annotated[
-        Vector | None, Shape("n"), "number of the tracer that was observed; -1: the robot; None: all are of the robot"
+        Vector | None,
+        Shape("n"),
+        "number of the tracer that was observed; -1: the robot; None: all are of the robot",
     ] = None
     entered: Annotated[
         Vector | None, Shape("n"), "1 for a tracer that came in while it was watched, see Tracers; None: no tracers"
