@@ -20,17 +20,15 @@ from flowrec.core import (
     Observations,
     SessionError,
     TopicTable,
-    UsageError,
     message_fields,
+    needs,
     unit_of,
     values_of,
 )
 from flowrec.store.table_columns import OBSERVED, STAMP, TIME, WALL, Column, columns_of
 
-try:
+with needs("a table", "export"):
     import pyarrow as pa
-except ModuleNotFoundError as error:
-    raise UsageError("tables need pyarrow, which is not installed: pip install 'flowrec[export]'") from error
 
 _ROWS = 4096
 _BATCH_BYTES = 8 << 20  # an export holds some five times as much: columns, copies, and the pages of its writer

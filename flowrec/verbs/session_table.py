@@ -11,15 +11,11 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from flowrec.core import UsageError
+from flowrec.core import UsageError, needs
 from flowrec.verbs.listed import unknown_name
 
-try:
+with needs("a condition of find or ls --where", "catalog", "DuckDB"):
     import duckdb
-except ModuleNotFoundError as error:
-    raise UsageError(
-        "find and ls --where need DuckDB, which is not installed: pip install 'flowrec[catalog]'"
-    ) from error
 
 AS_LIST = "[]"  # behind the name of a column of LISTS: its list rather than its text
 SqlError = duckdb.Error

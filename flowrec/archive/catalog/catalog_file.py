@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.archive.catalog.format import EVENTS, KEY, NAME, PARQUET, PLACE, SIGNATURE, SWEEP, About
-from flowrec.core import FlowrecError, Output, OutputError, UsageError, open_new, refuse_irregular, replacing, unit_of
+from flowrec.core import FlowrecError, Output, OutputError, needs, open_new, refuse_irregular, replacing, unit_of
 from flowrec.verbs import ALWAYS, LISTS, kind_of
 
-try:
+with needs("a catalog", "catalog"):
     import pyarrow as pa
     import pyarrow.parquet as pq
-except ModuleNotFoundError as error:
-    raise UsageError("a catalog needs pyarrow, which is not installed: pip install 'flowrec[catalog]'") from error
 
 _LOCK = ".lock"
 _LEVEL = 1  # of zstd

@@ -18,16 +18,14 @@ from typing import Any
 
 from flowrec.archive.sweep.replay_process import Row, failed_row, replay_task
 from flowrec.archive.sweep.tasks import Task
-from flowrec.core import NUMERICS_VERSION, FlowrecError, UsageError, __version__
+from flowrec.core import NUMERICS_VERSION, FlowrecError, UsageError, __version__, needs
 
-try:
+with needs("a sweep", "cluster", "Dask"):
     import dask
     import distributed
     from distributed.comm import CommClosedError
     from distributed.utils import silence_logging_cmgr
     from distributed.versions import VersionMismatchWarning
-except ModuleNotFoundError as error:
-    raise UsageError("a sweep needs Dask, which is not installed: pip install 'flowrec[cluster]'") from error
 
 _CONNECT_S = 10.0
 _STARTS = 3  # tries, because a worker may be killed before it is ready

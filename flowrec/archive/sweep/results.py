@@ -19,7 +19,7 @@ from flowrec.core import (
     Output,
     OutputError,
     SessionError,
-    UsageError,
+    needs,
     replace_content,
     replacing,
     sync_directory,
@@ -28,11 +28,9 @@ from flowrec.core import (
 )
 from flowrec.store import UrlPath
 
-try:
+with needs("a sweep", "cluster"):
     import pyarrow as pa
     import pyarrow.parquet as pq
-except ModuleNotFoundError as error:
-    raise UsageError("a sweep needs pyarrow, which is not installed: pip install 'flowrec[cluster]'") from error
 
 PARQUET = (".parquet",)
 _OURS = b"flowrec_sweep"  # key of the file's metadata: which columns are settings and figures, as JSON
