@@ -19,10 +19,11 @@ from hypothesis import settings
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 from threadpoolctl import threadpool_limits
+from typer.testing import CliRunner, Result
 
 from flowrec.core.system.numba_setup import _cache_folder
 from flowrec.stages.config import load_config
-from flowrec.verbs.cli import main
+from flowrec.verbs.cli import app, main
 from flowrec.verbs.record import record
 from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
@@ -133,6 +134,22 @@ def run(words: Iterable[object]) -> int:
     with mock.patch("sys.argv", ["flowrec", *map(str, words)]), pytest.raises(SystemExit) as ended:
         main()
     return int(ended.value.code or 0)
+
+
+def invoke(*words: object, **options: Any) -> Result:
+    """What `flowrec` with these words makes of them; what it raises is the result's `exception`."""
+    return CliRunner().invoke(app, [*map(str, words)], **options)
+
+
+def typed(*words: object) -> Result:
+    """The same, but what it raises is raised."""
+    return invoke(*words, catch_exceptions=False)
+
+
+def answered(*words: object) -> tuple[int, str]:
+    """Exit status and output of `flowrec` with these words."""
+    done = invoke(*words)
+    return done.exit_code, done.output
 
 
 def until(happened: Callable[[], object], told: Callable[[], str] = lambda: "waited in vain") -> None:

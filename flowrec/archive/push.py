@@ -41,21 +41,15 @@ _BY_ALL = "by reading all of it"
 
 @dataclass(frozen=True, slots=True)
 class PushedFile:
-    """An object that holds a file, compared with it.
-
-    Attributes
-    ----------
-    sent_bytes : what was sent by this call; 0 if it was there already, less than `size_bytes` if it was resumed.
-    sha256 : of the file.
-    compared : how, in words: by reading back what was sent, all of it or, where the ETag of the store is that of the
-        content, some ranges; '' where these credentials may not read it.
-    """
+    """An object that holds a file, compared with it."""
 
     file: Path
     url: UrlPath
     size_bytes: int
-    sent_bytes: int
-    sha256: str
+    sent_bytes: int  # what was sent by this call; 0 if it was there already, less than `size_bytes` if it was resumed
+    sha256: str  # of the file
+    # how, in words: by reading back what was sent, all of it or, where the ETag of the store is that of the content,
+    # some ranges; '' where these credentials may not read it
     compared: str
 
     def __str__(self) -> str:
@@ -70,9 +64,7 @@ class PushedFile:
 class Pushed:
     """Sessions that were pushed, and the errors of those that were not.
 
-    Attributes
-    ----------
-    failed : errors, by session.
+    `failed`: errors, by session.
     """
 
     target: str
@@ -197,11 +189,8 @@ def _read_back(url: UrlPath, file: Path, content: Content, etag: str) -> str:
     """Compare an object with the file that was sent to it; returns how, '' where these credentials may not read.
 
     The answer to what was sent is no evidence, a store may keep nothing. An ETag that is the MD5 of the content says
-    that all of it has arrived; then ranges of what is stored are read, its beginning and end among them.
-
-    Raises
-    ------
-    SessionError : it does not hold what was sent.
+    that all of it has arrived; then ranges of what is stored are read, its beginning and end among them. Raises
+    SessionError: it does not hold what was sent.
     """
     wrong = SessionError(f"{url}: does not hold what was sent; delete it, and push again")
     forget(url)

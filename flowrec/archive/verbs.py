@@ -188,8 +188,7 @@ def catalog(
         ),
     ] = None,
     serve: Annotated[
-        bool,
-        typer.Option("--serve", help="Then serve sessions to Rerun's viewer and catalog clients of this machine."),
+        bool, typer.Option("--serve", help="Then serve sessions to Rerun's viewer and catalog clients of this machine.")
     ] = False,
     where: Annotated[str, typer.Option(metavar="SQL", help="With --serve: of which sessions, as of find.")] = "",
     port: Annotated[

@@ -6,7 +6,6 @@ import importlib
 
 import typer
 
-from flowrec.core import UsageError
 from flowrec.verbs import WholeDescriptions
 
 BENCHES = {
@@ -20,10 +19,6 @@ BENCHES = {
     "worlds": "The refined map in worlds that are not the model's: errors, error bars and warnings of each refiner.",
     "solver": "The flow solver: deviation from exact and published solutions, time and memory.",
     "loop": "The control loop: time of one tick with recording and viewing on and off, and the speed of a replay.",
-}
-MOVED = {
-    **{name: f"tests.perf.{name}" for name in ("store", "fuzz", "clocks", "large", "grid")},
-    "train": "flowrec.bench.training",
 }
 
 bench = typer.Typer(
@@ -39,12 +34,5 @@ def _bench(context: typer.Context) -> None:
     run(module.measure, module.show, context.args, context.command_path, BENCHES[str(context.info_name)])
 
 
-def _refuse_moved(context: typer.Context) -> None:
-    words = f"python -m {MOVED[str(context.info_name)]} --help"
-    raise UsageError(f"{context.command_path} has moved: run '{words}' in a clone of the repository")
-
-
 for _name, _summary in BENCHES.items():
     bench.command(_name, help=_summary, context_settings=_ALL_WORDS)(_bench)
-for _name in MOVED:
-    bench.command(_name, hidden=True, context_settings=_ALL_WORDS)(_refuse_moved)

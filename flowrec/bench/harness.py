@@ -126,8 +126,8 @@ def _common(as_json: AsJson = False, out: JsonFile = None, overwrite: Overwrite 
     """Declares the options of every bench."""
 
 
-def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str]) -> None:
-    """Print a table: a format string of the row's keys by heading, as in {"RMSE": "{rmse_um:.1f}"}. None is "-"."""
+def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str], text: str = "") -> None:
+    """Print a `table`: a format string of the row's keys by heading, as in {"RMSE": "{rmse_um:.1f}"}. None is "-"."""
 
     def cell(template: str, row: Results) -> str:
         try:
@@ -135,7 +135,9 @@ def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str]) -> 
         except TypeError:  # None has no format
             return "-"
 
-    table(title, tuple(columns), [tuple(cell(template, row) for template in columns.values()) for row in rows])
+    table(
+        title, tuple(columns), [tuple(cell(template, row) for template in columns.values()) for row in rows], text=text
+    )
 
 
 def need_matplotlib() -> None:
@@ -177,10 +179,7 @@ def cut_torn_end(path: Path) -> None:
 def choose_names(what: str, names: str | None, known: Iterable[str]) -> tuple[str, ...]:
     """The names in "A,B", all known ones if there are none given.
 
-    Raises
-    ------
-    UsageError
-        If a name is not known; `what` is the kind of name, as in "bench flow: no method".
+    Raises UsageError if a name is not known; `what` is the kind of name, as in "bench flow: no method".
     """
     known = tuple(known)
     wanted = known if names is None else tuple(dict.fromkeys(names.split(",")))

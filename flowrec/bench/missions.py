@@ -121,9 +121,7 @@ class Row:
 class MissionLog:
     """A sink that collects the data of a row.
 
-    Parameters
-    ----------
-    limits : what the coils can do.
+    `limits`: what the coils can do.
     """
 
     def __init__(self, limits: CommandLimits) -> None:
@@ -179,12 +177,8 @@ def measure(
 ) -> Results:
     """Rows by mission, a summary by policy, and pairs of policies compared on the trips on which both arrived.
 
-    Seeds take the bifurcation, the random vessels and each of the `cases`, as it is and slowed down, in turn.
-
-    Raises
-    ------
-    UsageError
-        If there is no such policy, world or kind of coils, or no case in `cases`.
+    Seeds take the bifurcation, the random vessels and each of the `cases`, as it is and slowed down, in turn. Raises
+    UsageError if there is no such policy, world or kind of coils, or no case in `cases`.
     """
     names = choose_names("bench missions: no policy", policies, POLICIES)
     known_worlds = choose_names("bench missions: no world", worlds, WORLDS)
@@ -200,10 +194,7 @@ def measure(
         for policy in names
     ]
     rows: list[Row] = []
-    with (
-        progress("flying", len(missions), "missions") as done,
-        pool(jobs) as workers,
-    ):
+    with progress("flying", len(missions), "missions") as done, pool(jobs) as workers:
         columns = zip(*missions, strict=True)
         for row in workers.map(fly, *columns, chunksize=4) if jobs > 1 else map(fly, *columns):
             rows.append(row)

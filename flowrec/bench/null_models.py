@@ -39,10 +39,7 @@ class NullModel:
     def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
         """The field that fits, and its standard deviation.
 
-        Raises
-        ------
-        FlowError
-            If nothing was observed, or the sensitivities can not be computed.
+        Raises FlowError if nothing was observed, or the sensitivities can not be computed.
         """
         if not len(observations.std_um_s):
             raise FlowError(f"{self.method}: there are no observations")

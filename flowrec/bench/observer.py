@@ -153,10 +153,7 @@ def measure(
 ) -> Results:
     """Error by case and observer; with a recorded session also the settings that it recommends.
 
-    Raises
-    ------
-    UsageError
-        If the session is too short.
+    Raises UsageError if the session is too short.
     """
     rows: list[dict[str, Any]] = []
     drawn: tuple[Floats, Floats, dict[str, Floats]] | None = None

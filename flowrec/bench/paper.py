@@ -53,22 +53,14 @@ CASES_A_CELL = 20  # that the published intervals are meant to have
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """A row of the table.
+    """A row of the table."""
 
-    Attributes
-    ----------
-    of : what of the paper it is.
-    case : seed, folder of the reference data or None, and the values of a cell to the results of a row.
-    cells : the values by name; their product are the cells.
-    seeds : as many there are at most; None: without end.
-    needs : folder in the reference data, without which the experiment is left out.
-    """
-
-    of: str
+    of: str  # what of the paper it is
+    # seed, folder of the reference data or None, and the values of a cell to the results of a row
     case: Callable[..., Results]
-    cells: dict[str, Sequence[Any]]
-    seeds: int | None = None
-    needs: str = ""
+    cells: dict[str, Sequence[Any]]  # the values by name; their product are the cells
+    seeds: int | None = None  # as many there are at most; None: without end
+    needs: str = ""  # folder in the reference data, without which the experiment is left out
 
     def each_cell(self) -> list[Cell]:
         """The cells, the last of the values varying fastest."""
@@ -159,10 +151,7 @@ def measure(
 ) -> Results:
     """Rows by experiment and cell: how many there are, and how long all of them take.
 
-    Raises
-    ------
-    UsageError
-        If there is no such experiment, the rows in the folder can not be read, or a package is missing.
+    Raises UsageError if there is no such experiment, the rows in the folder can not be read, or a package is missing.
     """
     names = choose_names("bench paper: no experiment", only, experiments)
     if importlib.util.find_spec("pyarrow") is None:

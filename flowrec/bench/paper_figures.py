@@ -35,11 +35,7 @@ TABLE_1 = ("fvm", "gain", "modes", "network", "gp", "ni", "pinn", "unet", "pi_un
 VESSELS = {"crops": "fundus crops", "drawn": "drawn vessels", "openfoam": "OpenFOAM vessels"}
 WAYS = {"down": (style.BLUE, "downstream"), "up": (style.VERMILLION, "upstream")}
 _SPEEDS = "viridis"
-_LAWS = {
-    "paper, with compensation": "compensated",
-    "paper, without": "without",
-    "paper, with observer": "by observer",
-}
+_LAWS = {"paper, with compensation": "compensated", "paper, without": "without", "paper, with observer": "by observer"}
 
 
 def refinements(rows: Rows, vessels: str) -> list[Results]:

@@ -64,10 +64,7 @@ def measure(
 ) -> Results:
     """Rows by trip, regime and planner, their summaries, and the tables of reserves unless `quick`.
 
-    Raises
-    ------
-    UsageError
-        If there is no case with a trip, or no such method.
+    Raises UsageError if there is no case with a trip, or no such method.
     """
     names = installed_methods(METHODS) if methods is None else choose_names("bench plan: no method", methods, METHODS)
     source = worlds(side_px, seed) if cases is None else worlds_of(cases)

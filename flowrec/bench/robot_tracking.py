@@ -175,11 +175,7 @@ def together(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
 def recorded_movies(folder: Path) -> Iterator[tuple[str, RobotMovie]]:
     """Each object that NAME.csv (frame, x_px, y_px, particle) follows through all images of NAME/*.png.
 
-    The radius is a quarter of the least distance of two objects, but at most 8 px.
-
-    Raises
-    ------
-    UsageError : no such files.
+    The radius is a quarter of the least distance of two objects, but at most 8 px. Raises UsageError: no such files.
     """
     tables = sorted(folder.glob("*.csv"))
     if not tables:

@@ -18,16 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter, map_coordinates
 
-from flowrec.bench.second_chips import (
-    FINE,
-    SIDE_PX,
-    DrawnChip,
-    coarse,
-    draw_chip,
-    draw_discs,
-    side_channel,
-    to_fine,
-)
+from flowrec.bench.second_chips import FINE, SIDE_PX, DrawnChip, coarse, draw_chip, draw_discs, side_channel, to_fine
 from flowrec.bench.vessels import photograph, threshold_by_neighbours, threshold_by_otsu
 from flowrec.core import Bools, Floats, FlowError, FlowField, Observations
 from flowrec.physics import CarreauYasuda, Chip, FlowSolver, Opening, find_openings
@@ -238,10 +229,7 @@ def _right_words(world: SecondWorld, faults: Sequence[str], offset_px: Floats) -
 def make_survey(world: str, seed: int) -> MadeSurvey:
     """The survey of a world and a seed; chip and survey of a seed differ between worlds only by their faults.
 
-    Raises
-    ------
-    FlowError
-        If no flow can be solved on any chip that is drawn.
+    Raises FlowError if no flow can be solved on any chip that is drawn.
     """
     faults = faults_of(world, seed)
     for attempt in range(_ATTEMPTS):

@@ -186,13 +186,7 @@ def measure(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 1,
     draws: Annotated[int, typer.Option(min=1, help="Draws of the noise per case; the error is their mean.")] = 4,
 ) -> Results:
-    """Rows by case and way, and a summary by way.
-
-    Raises
-    ------
-    UsageError
-        If there is no case or no such way.
-    """
+    """Rows by case and way, and a summary by way. Raises UsageError if there is no case or no such way."""
     names = choose_names("bench survey: no way", ways, WAYS)
     rows: list[dict[str, Any]] = []
     with ExitStack() as stack:

@@ -68,10 +68,7 @@ def measure(
 ) -> Results:
     """Flights, and a summary by world and method.
 
-    Raises
-    ------
-    UsageError
-        If there is no such world or method, or `rows` is not a file of flights.
+    Raises UsageError if there is no such world or method, or `rows` is not a file of flights.
     """
     names = choose_names("bench worlds: no world", worlds, (*WORLDS, *SECOND_WORLDS))
     wanted = choose_names("bench worlds: no method", methods, KNOWN)

@@ -22,18 +22,12 @@ _MOST_EVENTS = 100  # the last ones, for pages that open later
 
 
 class PageContents(NamedTuple):
-    """All that a page can show at a moment.
-
-    Attributes
-    ----------
-    picture : the last image that was made for pages.
-    events : the number of them so far.
-    """
+    """All that a page can show at a moment."""
 
     state: dict[str, Any]
     drawing: Drawing
-    picture: bytes
-    events: int
+    picture: bytes  # the last image that was made for pages
+    events: int  # the number of them so far
     ended: RunEnded | None
 
 

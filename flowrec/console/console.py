@@ -29,50 +29,30 @@ STAYS = "flowrec: shows its pages how the run ended"  # what the process says la
 
 
 class Begin(NamedTuple):
-    """The first message to the console's process; ticks and replies follow.
+    """The first message to the console's process; ticks and replies follow."""
 
-    Attributes
-    ----------
-    token : that a browser must know.
-    name : of the session's file.
-    rerun_port : of Rerun's server on this machine; None without one.
-    """
-
-    token: str
-    name: str
+    token: str  # that a browser must know
+    name: str  # of the session's file
     scene: Scene
-    rerun_port: int | None
+    rerun_port: int | None  # of Rerun's server on this machine; None without one
 
 
 class CommandReply(NamedTuple):
-    """Answer of the run to a command.
+    """Answer of the run to a command."""
 
-    Attributes
-    ----------
-    ticket : number of the command, as the server counts them.
-    refusal : why the run does not do it; '' where it has taken it.
-    """
-
-    ticket: int
-    refusal: str
+    ticket: int  # number of the command, as the server counts them
+    refusal: str  # why the run does not do it; '' where it has taken it
 
 
 class RunEnded(NamedTuple):
-    """The last message to the console's process: how the run ended, and where its file is.
+    """The last message to the console's process: how the run ended, and where its file is."""
 
-    Attributes
-    ----------
-    outcome : in a few words.
-    good : the mission was completed; green, as in all pictures, and else red.
-    told : sentences as in all pictures, see `verdict_lines`; none where only the outcome is known.
-    doubtful : its result is.
-    """
-
-    outcome: str
+    outcome: str  # in a few words
     files: str = ""
-    good: bool = False
+    good: bool = False  # the mission was completed; green, as in all pictures, and else red
+    # sentences as in all pictures, see `verdict_lines`; none where only the outcome is known
     told: tuple[str, ...] = ()
-    doubtful: bool = False
+    doubtful: bool = False  # its result is
 
     @classmethod
     def of(cls, figures: Mapping[str, Value], refined: FlowField | None, files: str) -> RunEnded:

@@ -29,7 +29,7 @@ from .enums import (
 from .errors import (
     ChipError as ChipError, FlowError as FlowError, FlowrecError as FlowrecError, MovieError as MovieError,
     NotFiniteError as NotFiniteError, RigError as RigError, SessionError as SessionError,
-    UnreachableError as UnreachableError, UsageError as UsageError, printable as printable,
+    UnreachableError as UnreachableError, UsageError as UsageError, needs as needs, printable as printable,
 )
 from .interpolation import (
     bilinear as bilinear, bilinear_known as bilinear_known, cell_at as cell_at, cells_at as cells_at,

@@ -64,11 +64,8 @@ def _value(text: str) -> Any:
 def settings_of(sets: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
     """Settings by key, as in {"robot.um_per_rev": 24}: values as they are, or texts `key=value` of a command line.
 
-    The value of a text is TOML, or a bare word. Of numpy and of paths the plain value is taken.
-
-    Raises
-    ------
-    UsageError : a text has no `=`, or a value is of a type that no setting has.
+    The value of a text is TOML, or a bare word. Of numpy and of paths the plain value is taken. Raises UsageError: a
+    text has no `=`, or a value is of a type that no setting has.
     """
     if isinstance(sets, str):
         raise UsageError(f"sets = {sets!r}: give a list, as [{sets!r}], or a dictionary")
@@ -135,9 +132,8 @@ def take_registration(tree: dict[str, Any], sets: Mapping[str, Any]) -> None:
 def place_paths(tree: dict[str, Any], file: Path) -> None:
     """Let the relative paths in the tree of a file begin at the folder of the file, wherever the command is run.
 
-    Raises
-    ------
-    UsageError : there is no such file in that folder, but one in the working directory: which is meant is not guessed.
+    Raises UsageError: there is no such file in that folder, but one in the working directory: which is meant is not
+    guessed.
     """
     for key in FILES:
         section, _, name = key.partition(".")

@@ -63,9 +63,7 @@ class Coverage:
     def sentence(self, found: str) -> str:
         """The amount with the result, stated of the part that was looked at alone: "1934 of 1934 ticks: identical".
 
-        Parameters
-        ----------
-        found : true of what was looked at, such as "identical".
+        `found`: true of what was looked at, such as "identical".
         """
         if not self.stopped:
             return f"{self.amount}: {found}"

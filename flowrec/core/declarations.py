@@ -75,23 +75,14 @@ def coil_names(count: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class MessageField:
-    """One field of a message type.
-
-    Attributes
-    ----------
-    kind : int, float, bool, str, "vector" or "array".
-    optional : the field may be None.
-    dtype : of an array, else None.
-    shape : None where the declaration gives none, as for every plain number.
-    meaning : in words; that of its message type where the declaration has none.
-    """
+    """One field of a message type."""
 
     name: str
-    kind: Any
-    optional: bool
-    dtype: np.dtype[Any] | None
-    shape: Shape | None
-    meaning: str
+    kind: Any  # int, float, bool, str, "vector" or "array"
+    optional: bool  # the field may be None
+    dtype: np.dtype[Any] | None  # of an array, else None
+    shape: Shape | None  # None where the declaration gives none, as for every plain number
+    meaning: str  # in words; that of its message type where the declaration has none
 
     @property
     def is_float(self) -> bool:
@@ -111,12 +102,7 @@ def _keep(function: Callable[[type], Result]) -> Callable[[type], Result]:
 
 @_keep
 def message_fields(message_type: type) -> tuple[MessageField, ...]:
-    """The fields of a message type, in order.
-
-    Raises
-    ------
-    TypeError : an annotation that has no wire form.
-    """
+    """The fields of a message type, in order. Raises TypeError: an annotation that has no wire form."""
     return tuple(_declared_fields(message_type))
 
 
@@ -199,9 +185,7 @@ class as_read:  # noqa: N801 - a context
 class Message:
     """Base of all records: sets the dtype of the arrays, makes them read-only, and refuses numbers that are not finite.
 
-    Raises
-    ------
-    NotFiniteError : NaN or infinity in a field whose declaration does not permit it, outside of `as_read`.
+    Raises NotFiniteError: NaN or infinity in a field whose declaration does not permit it, outside of `as_read`.
     """
 
     __slots__ = ()
@@ -332,18 +316,13 @@ class Source(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SlowStage:
-    """Dependencies of a result of the worker.
+    """Dependencies of a result of the worker."""
 
-    Attributes
-    ----------
-    orders : the work orders (`Mission.wanted`) that it answers, each with the settings that its computation reads
-        itself: sections of the configuration, or one setting of a section as `section.name`.
-    reads : fields of the ordering tick that are needed, besides its stamp and the mission.
-    settings : sections of the configuration on which it depends, besides those on which what it reads depends.
-    """
-
+    # the work orders (`Mission.wanted`) that it answers, each with the settings that its computation reads itself:
+    # sections of the configuration, or one setting of a section as `section.name`
     orders: Mapping[WorkOrder, tuple[str, ...]]
-    reads: tuple[str, ...]
+    reads: tuple[str, ...]  # fields of the ordering tick that are needed, besides its stamp and the mission
+    # sections of the configuration on which it depends, besides those on which what it reads depends
     settings: tuple[str, ...]
 
 

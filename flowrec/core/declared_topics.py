@@ -41,15 +41,13 @@ _TEXT_LIMIT, _FIELDS_LIMIT, _NAME_LIMIT, _AXES_LIMIT = 1 << 16, 200, 100, 8
 class TopicTable:
     """The fields of `Tick`, and the extra topics of a run or of a file.
 
+    Raises UsageError: a topic that can not be declared, or two of one path.
+
     Attributes
     ----------
     extra : topics that are no field of `Tick`; their field is their path.
     topics : all, those of `Tick` first.
     by_field, by_path : all, by name.
-
-    Raises
-    ------
-    UsageError : a topic that can not be declared, or two of one path.
     """
 
     __slots__ = ("by_field", "by_path", "extra", "topics")
@@ -79,9 +77,7 @@ class TopicTable:
     def as_declared(self, message: Message, path: str) -> Message:
         """A message of an extra topic, as a file declares it, in the type that this table declares.
 
-        Raises
-        ------
-        UsageError : the type has no such field, or one more that has no default.
+        Raises UsageError: the type has no such field, or one more that has no default.
         """
         kind = self.by_path[path].type
         if type(message) is kind:
@@ -223,9 +219,7 @@ def _type_of(path: str, text: str) -> type[Message]:
 def declared_topic(path: str, text: str) -> Topic:
     """The topic of a path by its declaration as JSON, as a file holds it; the same type for the same text.
 
-    Raises
-    ------
-    UsageError : one line; it is damaged, too large, or declares what can not be recorded.
+    Raises UsageError: one line; it is damaged, too large, or declares what can not be recorded.
     """
     try:
         if len(text) > _TEXT_LIMIT:

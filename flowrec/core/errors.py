@@ -4,6 +4,8 @@ The command line prints these without a traceback; anything else is a defect of 
 """
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # C0, DEL and C1 controls, what turns the direction of writing, line separators, halves of characters.
 _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -55,3 +57,13 @@ class RigError(FlowrecError):
 
 class SessionError(FlowrecError):
     """A session file can not be read or written."""
+
+
+@contextmanager
+def needs(what: str, extra: str, package: str = "") -> Iterator[None]:
+    """Import packages of an extra. Raises UsageError: one is not installed; it says what needs it, and the command."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = package or error.name
+        raise UsageError(f"{what} needs {missing}, which is not installed: pip install 'flowrec[{extra}]'") from error

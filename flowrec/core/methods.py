@@ -22,38 +22,22 @@ _ALIKE = 0.4  # least likeness of two names, as difflib counts it, of which one 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """One row.
+    """One row."""
 
-    Attributes
-    ----------
-    name : value of the setting that selects the method.
-    target : "module:name" of what implements it, imported when the method is first used.
-    summary : what it does, in one line.
-    options : names of the settings of the stage that this method reads. A setting that no row names is for all methods.
-    extra : extra of pyproject.toml that installs what the method needs, "" if it needs none.
-    needs : what the method requires of other stages, or of its own inputs, besides what all methods get.
-    provides : what the method states in its result besides what all methods state.
-    source : the package of others that the row is of; None: it is ours.
-    settings : of a row of others: the frozen dataclass of its settings, a section named by the row.
-    """
-
-    name: str
-    target: str
-    summary: str
+    name: str  # value of the setting that selects the method
+    target: str  # "module:name" of what implements it, imported when the method is first used
+    summary: str  # what it does, in one line
+    # names of the settings of the stage that this method reads. A setting that no row names is for all methods.
     options: tuple[str, ...] = ()
-    extra: str = ""
+    extra: str = ""  # extra of pyproject.toml that installs what the method needs, "" if it needs none
+    # what the method requires of other stages, or of its own inputs, besides what all methods get
     needs: tuple[str, ...] = ()
-    provides: tuple[str, ...] = ()
-    source: Outside | None = None
-    settings: Any = None
+    provides: tuple[str, ...] = ()  # what the method states in its result besides what all methods state
+    source: Outside | None = None  # the package of others that the row is of; None: it is ours
+    settings: Any = None  # of a row of others: the frozen dataclass of its settings, a section named by the row
 
     def load(self) -> Any:
-        """Import the object that implements the method.
-
-        Raises
-        ------
-        UsageError : a package of `extra` is not installed.
-        """
+        """Import the object that implements the method. Raises UsageError: a package of `extra` is not installed."""
         try:
             return pkgutil.resolve_name(self.target)
         except ModuleNotFoundError as error:
@@ -72,9 +56,7 @@ class Method:
     def section(self, stage: Any) -> Any:
         """The section of its settings, its only option, in those of its stage: it is the method itself.
 
-        Raises
-        ------
-        UsageError : it is of a package of others, and the settings are not there or of another version.
+        Raises UsageError: it is of a package of others, and the settings are not there or of another version.
         """
         found = getattr(stage, self.options[0], None)
         if self.source is not None and not isinstance(found, self.settings):
@@ -92,20 +74,14 @@ class NoSettings:
 
 @dataclass(frozen=True, slots=True)
 class ListedMethod:
-    """A row for `flowrec methods`.
-
-    Attributes
-    ----------
-    package : it comes from, with its version unless it is ours.
-    fault : why it can not be used, "" if it can.
-    """
+    """A row for `flowrec methods`."""
 
     setting: str
     name: str
     summary: str
-    package: str
+    package: str  # it comes from, with its version unless it is ours
     extra: str = ""
-    fault: str = ""
+    fault: str = ""  # why it can not be used, "" if it can
 
 
 class Methods(Mapping[str, Method]):
@@ -159,9 +135,7 @@ class Methods(Mapping[str, Method]):
     def outside(self, name: str) -> Method | None:
         """The row of a package of others; None if no package declares one of that name, or it is one of ours.
 
-        Raises
-        ------
-        UsageError : the package can not be imported, or what it declares is no row of this table.
+        Raises UsageError: the package can not be imported, or what it declares is no row of this table.
         """
         if name in self._rows:
             return None

@@ -42,12 +42,7 @@ class Outside:
         return f"{self.package} {self.version}"
 
     def load(self) -> Any:
-        """The object.
-
-        Raises
-        ------
-        UsageError : one line that names the package, whatever its import raises.
-        """
+        """The object. Raises UsageError: one line that names the package, whatever its import raises."""
         module, _, path = self.target.partition(":")
         try:
             return functools.reduce(getattr, path.split("."), importlib.import_module(module))
@@ -98,12 +93,7 @@ def entry_points_of(group: str) -> dict[str, tuple[Outside, ...]]:
 
 
 def the_one(group: str, name: str) -> Outside | None:
-    """The entry point of a name; None if no package declares it.
-
-    Raises
-    ------
-    UsageError : several packages declare it.
-    """
+    """The entry point of a name; None if no package declares it. Raises UsageError: several packages declare it."""
     several = entry_points_of(group).get(name, ())
     if len(several) > 1:
         raise UsageError(f"{name} is declared by {' and by '.join(map(str, several))}; uninstall all but one of them")

@@ -36,19 +36,11 @@ _DIFF_LIMIT = 200_000  # characters; a larger change is cut and says so
 
 def provenance(anonymous: bool = False) -> dict[str, str]:
     """Facts about code, machine and time as text, for the header of a session; `anonymous` omits machine and user."""
-    facts = {
-        "flowrec": __version__,
-        "numerics_version": str(NUMERICS_VERSION),
-        "python": platform.python_version(),
-    }
+    facts = {"flowrec": __version__, "numerics_version": str(NUMERICS_VERSION), "python": platform.python_version()}
     if not anonymous:
         facts |= {"platform": platform.platform(), "host": platform.node(), "user": user_name()}
     monotonic_ns, wall_ns = read_clocks()
-    facts |= {
-        "wall_time": datetime.now(UTC).isoformat(),
-        "wall_ns": str(wall_ns),
-        "monotonic_ns": str(monotonic_ns),
-    }
+    facts |= {"wall_time": datetime.now(UTC).isoformat(), "wall_ns": str(wall_ns), "monotonic_ns": str(monotonic_ns)}
     for package in PACKAGES:
         try:
             facts[f"package.{package}"] = version(package)

@@ -43,9 +43,7 @@ def warn(text: str) -> None:
 class Progress:
     """Takes how far work is, and shows it nowhere.
 
-    Attributes
-    ----------
-    done : how much of the total is done, as it was said last.
+    `done`: how much of the total is done, as it was said last.
     """
 
     done: float = 0.0
@@ -72,12 +70,8 @@ def looked_at() -> list[Coverage]:
 def progress(what: str, total: float, unit: str = "parts") -> Iterator[Progress]:
     """A progress bar, which takes how much of `total` is done. Prints nothing without a terminal.
 
-    An interruption by Ctrl-C or a signal leaves it as `Ended`, with how far the work was; of bars within each other
-    the outer one says it.
-
-    Parameters
-    ----------
-    unit : of the total, as of `Coverage`.
+    An interruption by Ctrl-C or a signal leaves it as `Ended`, with how far the work was; of bars within each other the
+    outer one says it. `unit`: of the total, as of `Coverage`.
     """
     with _show_bar(what, total) as shown:
         try:

@@ -178,9 +178,7 @@ class Tick:
 def topics_of(tick_type: type) -> tuple[Topic, ...]:
     """The topics that the annotations of a tick's fields declare, in order.
 
-    Raises
-    ------
-    TypeError : a declaration is missing, is used twice, or contradicts another one.
+    Raises TypeError: a declaration is missing, is used twice, or contradicts another one.
     """
     hints = get_type_hints(tick_type, include_extras=True)
     named = [each.name for each in dataclasses.fields(tick_type) if each.name != "stamp_ns"]

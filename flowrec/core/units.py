@@ -18,10 +18,7 @@ Z95 = 1.959964  # half of the interval that holds 95 %
 STD_PER_MAD = 1.4826  # standard deviation over the median of the absolute value
 TUKEY = 4.685  # residual from which on Tukey's weight is 0: an estimate with 95 % efficiency
 # Units on the command line.
-_PER = {
-    "s": {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
-    "mb": {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6},
-}
+_PER = {"s": {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}, "mb": {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6}}
 _AMOUNT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
 
 
@@ -43,9 +40,7 @@ def wrap_rad(angle_rad: float) -> float:
 def amounts(text: str) -> dict[str, list[float]]:
     """Times (key `s`, in s) and sizes (key `mb`, in MB) in a text such as `10min`, `2GB` or `30s,10s`.
 
-    Raises
-    ------
-    ValueError : a part of the text is neither.
+    Raises ValueError: a part of the text is neither.
     """
     found: dict[str, list[float]] = {kind: [] for kind in _PER}
     for part in text.split(","):

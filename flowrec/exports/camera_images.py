@@ -25,11 +25,8 @@ _OF_CAMERA = ("um_per_px", "angle_deg", "mirror", "centre_um", "exposure_s")  # 
 def with_images(session: Session, progress: TimeProgress = lambda _: None) -> Iterator[tuple[Tick, Frame]]:
     """Ticks with a new image of the camera. Where the camera gave none, or the last one again, there is no row.
 
-    `progress` takes the session time in s since the first tick, of each image that was taken.
-
-    Raises
-    ------
-    SessionError : the session holds no images.
+    `progress` takes the session time in s since the first tick, of each image that was taken. Raises SessionError: the
+    session holds no images.
     """
     last: Frame | None = None
     for tick in session.ticks():

@@ -41,29 +41,21 @@ EXPORTS = Methods(
 
 
 class Exporter(Protocol):
-    """Interface of a row of EXPORTS.
+    """Interface of a row of EXPORTS."""
 
-    Attributes
-    ----------
-    suffixes : that the name of the output ends in, the usual one first; of a folder "" allows any name.
-    folder : the output is a folder; else one file.
-    advice : how to open the output, as words before its name.
-    """
-
+    # that the name of the output ends in, the usual one first; of a folder "" allows any name
     suffixes: tuple[str, ...]
-    folder: bool
-    advice: str
+    folder: bool  # the output is a folder; else one file
+    advice: str  # how to open the output, as words before its name
 
     def write(self, session: Session, part: Path, progress: TimeProgress) -> None:
         """Write a new file, or fill an empty folder, which gets its name when this returns.
+
+        Raises SessionError: the session has nothing that this format holds, in one line. An OSError without a file
+        name, or with one inside `part`, becomes the error "can not be written".
 
         Parameters
         ----------
         part : the empty file or the empty folder; the suffix of a file is that of the output.
         progress : takes the session time in s since the first tick.
-
-        Raises
-        ------
-        SessionError : the session has nothing that this format holds, in one line. An OSError without a file name, or
-            with one inside `part`, becomes the error "can not be written".
         """

@@ -43,9 +43,7 @@ class Layouts:
 def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: bool = False) -> Layouts:
     """Write a layout for Foxglove and Lichtblick (.json) and one for Rerun (.rbl) into a folder.
 
-    Raises
-    ------
-    SessionError : the session can not be read; OutputError if a file may not be written.
+    Raises SessionError: the session can not be read; OutputError if a file may not be written.
     """
     session, folder = Session.of(session), Path(folder)
     files = tuple(files_behind(session.path))

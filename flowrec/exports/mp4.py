@@ -105,15 +105,13 @@ class PlainMp4Export:
 class Mp4Writer:
     """Encodes pictures in a thread of its own, while the next ones are drawn.
 
+    Raises OSError: the file can not be written.
+
     Parameters
     ----------
     path : of the file; it is whole when the context is left without an exception.
     size_px : width and height, both even.
     full_range : luma is 0 to 255; else 16 to 235, which more players show right.
-
-    Raises
-    ------
-    OSError : the file can not be written.
     """
 
     def __init__(

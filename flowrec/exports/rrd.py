@@ -39,9 +39,7 @@ _OF_COMMANDS = ("commands_compared", "commands_difference_rms_um_s")
 class RrdExport:
     """Implements flowrec.exports.formats.Exporter.
 
-    Parameters
-    ----------
-    second : a session that is shown beside the exported one; None: a replay is shown beside its parent.
+    `second`: a session that is shown beside the exported one; None: a replay is shown beside its parent.
     """
 
     suffixes: tuple[str, ...] = RRD

@@ -162,9 +162,7 @@ def _is_raster(kind: pa.DataType) -> bool:
 def _write_datapackage(folder: Path, session: Session, tables: list[dict[str, Any]], remark: str) -> None:
     """Write the description of a folder of tables, and beside it the settings and the chip of the session.
 
-    Parameters
-    ----------
-    tables : the description of each file.
+    `tables`: the description of each file.
     """
     header = session.header
     (folder / "config.toml").write_text(header.config_toml, encoding="utf-8")

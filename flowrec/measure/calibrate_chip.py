@@ -43,25 +43,16 @@ _SHOWN = {
 
 
 class PictureChip(NamedTuple):
-    """A chip of a picture.
-
-    Attributes
-    ----------
-    mask : (h, w) True in fluid.
-    pixel : size of a pixel of the mask, in pixels of the picture.
-    um_per_px : of the picture; None: not known.
-    openings : of the mask; which are inlets means nothing unless `inlets_known`.
-    speed_um_s : mean speed at the inlets; None: not known.
-    """
+    """A chip of a picture."""
 
     picture: SourcePicture
     found: Segmentation
-    mask: Mask
-    pixel: float
-    um_per_px: float | None
-    openings: tuple[Opening, ...]
+    mask: Mask  # (h, w) True in fluid
+    pixel: float  # size of a pixel of the mask, in pixels of the picture
+    um_per_px: float | None  # of the picture; None: not known
+    openings: tuple[Opening, ...]  # of the mask; which are inlets means nothing unless `inlets_known`
     inlets_known: bool
-    speed_um_s: float | None
+    speed_um_s: float | None  # mean speed at the inlets; None: not known
     wall_shift_um: float
     out: Path | None  # the TOML file, if it was written
 
@@ -137,6 +128,9 @@ def calibrate_chip(
 ) -> PictureChip:
     """Find the channel in a picture; write `out` (TOML), the mask of the same stem (PNG) and an overlay.
 
+    Raises FlowrecError: one line: the picture can not be read, shows no channel for sure, or the outputs may not be
+    written.
+
     Parameters
     ----------
     path : an image file, a movie or a session, of which the median is taken.
@@ -148,10 +142,6 @@ def calibrate_chip(
     channel : red, green, blue or grey of colours.
     wall_shift_um : all walls are moved outwards by so much; a known width shows by how much.
     seen : of an earlier call with the same picture, so that the channel need not be looked for again.
-
-    Raises
-    ------
-    FlowrecError : one line: the picture can not be read, shows no channel for sure, or the outputs may not be written.
     """
     if walls not in get_args(Shown):
         raise UsageError(f"--walls {walls}: choose one of {', '.join(get_args(Shown))}")

@@ -82,10 +82,8 @@ class CoilProposal(NamedTuple):
 def calibrate_coils(path: Path, out: Path | None = None, overwrite: bool = False) -> CoilProposal:
     """Fit the settings of the coils to a table, and write them to `out` if it is given.
 
-    Raises
-    ------
-    UsageError : the table can not be read or has too few rows, or no run could use such coils.
-    OutputError : `out` may not be written, see `Output.check`.
+    Raises UsageError: the table can not be read or has too few rows, or no run could use such coils; OutputError: `out`
+    may not be written, see `Output.check`.
     """
     outputs = check_outputs(out, (path,), overwrite)
     fit = fit_coils(read_excitations(path))

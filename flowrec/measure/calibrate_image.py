@@ -98,6 +98,9 @@ def calibrate_image(
 ) -> ImageRegistration:
     """Register the chip of a configuration in a picture; write the settings to `out`, and the overlay beside it.
 
+    Raises FlowrecError: one line: the picture can not be read, does not show the chip, or the outputs may not be
+    written.
+
     Parameters
     ----------
     path : an image file, a movie or a session, of which the median is taken.
@@ -105,10 +108,6 @@ def calibrate_image(
     mirror : whether the image is mirrored; None: both are tried.
     pick : which of several equally good poses is meant, from 1.
     inputs : files that were read besides; the outputs may be none of them.
-
-    Raises
-    ------
-    FlowrecError : one line: the picture can not be read, does not show the chip, or the outputs may not be written.
     """
     outputs = check_outputs(out, (path, *inputs), overwrite, (".png",))
     picture = read_picture(path, config.movie.channel)

@@ -94,9 +94,7 @@ def calibrate_motion(
 ) -> MotionCalibration:
     """Compare the track of a session with what its coils did, and write the settings found to `out` if it is given.
 
-    Parameters
-    ----------
-    coils : another log, on any clock; None: the session's own.
+    `coils`: another log, on any clock; None: the session's own.
 
     Raises
     ------
@@ -209,11 +207,7 @@ def sampled_s(log: FieldLog, image_s: float) -> float | None:
 
 
 def fit_samples(
-    stamps_ns: Ints,
-    positions_um: Floats,
-    log: FieldLog,
-    within: SearchRange,
-    flow: FlowField | None = None,
+    stamps_ns: Ints, positions_um: Floats, log: FieldLog, within: SearchRange, flow: FlowField | None = None
 ) -> MotionFit | None:
     """The fit to a log whose rows are samples of a field that changes between them; None: they are not, or too few.
 

@@ -59,11 +59,7 @@ def read_excitations(path: Path) -> Excitations:
     """Read a CSV file of currents that were set and fields that a probe at the robot's position showed.
 
     Its columns are i_x_a, i_y_a, i_z_a, or of more than three coils i_1_a, i_2_a, ..., and b_x_mt, b_y_mt, b_z_mt, in
-    any order; lines that begin with # are comments.
-
-    Raises
-    ------
-    UsageError : a file that can not be read, with the line.
+    any order; lines that begin with # are comments. Raises UsageError: a file that can not be read, with the line.
     """
     refuse_irregular(path)
     try:
@@ -181,11 +177,8 @@ class CoilFit(NamedTuple):
 def fit_coils(excitations: Excitations) -> CoilFit:
     """Fit A and b by least squares.
 
-    Leave-one-out residuals follow from the leverages h of the one fit: e / (1 - h).
-
-    Raises
-    ------
-    UsageError : too few or dependent rows, and which to add; coils whose fields are linearly dependent.
+    Leave-one-out residuals follow from the leverages h of the one fit: e / (1 - h). Raises UsageError: too few or
+    dependent rows, and which to add; coils whose fields are linearly dependent.
     """
     currents, field, where = excitations.currents_a, excitations.field_mt, excitations.name
     _refuse_too_little(excitations)

@@ -63,9 +63,7 @@ class Winding(NamedTuple):
 def winding_of(text: str) -> Winding:
     """The winding of a text, as in x:helmholtz:50:120, -y:pair:60:150:55, z:coil:30:200:25 or x:maxwell:50:80.
 
-    Raises
-    ------
-    UsageError : one line: a text of another form, or a number that is no length.
+    Raises UsageError: one line: a text of another form, or a number that is no length.
     """
     where = f"--winding {text}"
     axis, *rest = (part.strip().lower() for part in text.split(":"))
@@ -130,10 +128,8 @@ class WindingProposal(NamedTuple):
 def windings_matrix(texts: Sequence[str], out: Path | None = None, overwrite: bool = False) -> WindingProposal:
     """The matrix coils.mt_per_a of windings, a column each in their order; written to `out` if it is given.
 
-    Raises
-    ------
-    UsageError : a text that is no winding, or windings that can not make every field, in one line.
-    OutputError : `out` may not be written, see `Output.check`.
+    Raises UsageError: a text that is no winding, or windings that can not make every field, in one line; OutputError:
+    `out` may not be written, see `Output.check`.
     """
     outputs = check_outputs(out, (), overwrite)
     proposal = WindingProposal(tuple(map(winding_of, texts)), out)

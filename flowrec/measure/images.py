@@ -84,30 +84,19 @@ def with_curves(picture: Image, curves: Iterable[Floats]) -> tuple[Colours, int]
 
 
 class SourcePicture(NamedTuple):
-    """A picture and where it comes from.
+    """A picture and where it comes from."""
 
-    Attributes
-    ----------
-    image : (h, w) grey levels.
-    source : name of the file, and what was made of it.
-    sha256 : of the file.
-    covered : the images of which it is the median, of all.
-    """
-
-    image: Image
-    source: str
-    sha256: str
-    covered: Coverage
+    image: Image  # (h, w) grey levels
+    source: str  # name of the file, and what was made of it
+    sha256: str  # of the file
+    covered: Coverage  # the images of which it is the median, of all
 
 
 def read_picture(path: Path, channel: str | None = None) -> SourcePicture:
     """The picture in a file: what does not move, if the file holds many images.
 
-    `channel` chooses red, green, blue or grey of colours.
-
-    Raises
-    ------
-    FlowrecError : one line: no such file, none that can be read, or colour without a choice.
+    `channel` chooses red, green, blue or grey of colours. Raises FlowrecError: one line: no such file, none that can be
+    read, or colour without a choice.
     """
     if not path.exists():
         raise UsageError(f"{path}: no such picture; it is an image file, a movie, or a session")

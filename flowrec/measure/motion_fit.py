@@ -27,17 +27,7 @@ from flowrec.core import FlowField, UsageError
 from flowrec.measure.motion_regression import MotionRegression, Place, TrackRegression, Turns, heading_and_size
 from flowrec.measure.motion_search import SearchRange, search
 from flowrec.physics import sample
-from flowrec.stages import (
-    FREEDOM,
-    RESTART,
-    SKIPPED,
-    USED,
-    Flags,
-    Floats,
-    fit_noise,
-    whiten,
-    without_jumps,
-)
+from flowrec.stages import FREEDOM, RESTART, SKIPPED, USED, Flags, Floats, fit_noise, whiten, without_jumps
 
 # Of 72 simulated missions all pass with their own log, which explains 0.73 to 0.97. Of 288 comparisons with logs of
 # other runs, which explain 0 to 0.5 in most cases, 2 pass: on the same chip, where the commands are nearly the same and
@@ -105,7 +95,7 @@ def fit_motion(
     log_error_s: float = 0.0,
     own_log: bool = False,
 ) -> MotionFit:
-    """Place a movie in a log.
+    """Place a movie in a log. Raises UsageError: too few frames, a robot that does not move, or a log without turns.
 
     Parameters
     ----------
@@ -116,10 +106,6 @@ def fit_motion(
     exact_log : it tells what the field did; else what was commanded, which takes effect within a turn of the field.
     log_error_s : standard error of the times at which the log says that the field changed.
     own_log : it is that of this run for certain.
-
-    Raises
-    ------
-    UsageError : too few frames, a robot that does not move, or a log without turns.
     """
     time_s, positions = _check_track(stamps_s, positions_um)
     carried = _flow_displacement(time_s, positions, flow)

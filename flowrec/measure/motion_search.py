@@ -51,13 +51,8 @@ def search(
 ) -> tuple[list[Candidate], float]:
     """Candidates for the place of a movie in a log, best first; none where the log has no turns.
 
-    Parameters
-    ----------
-    log_span_s : first and last time of the log.
-
-    Returns
-    -------
-    The candidates, and the probability that a log of another run reaches the first one's r2 somewhere in the search.
+    `log_span_s`: first and last time of the log. Returns the candidates, and the probability that a log of another run
+    reaches the first one's r2 somewhere in the search.
     """
     motion, turns = _Motion(track), track.turns
     rates = _rates(motion, within)

@@ -44,33 +44,20 @@ _FINER = 4  # pixels that are drawn for one of the mask
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """The walls of a channel in a picture.
+    """The walls of a channel in a picture."""
 
-    Attributes
-    ----------
-    curves : closed polygons (n, 2), x, y in pixels; they go on beyond the picture's border.
-    size_px : width and height of the picture.
-    walls : what a wall looks like.
-    width_px : width of the channel that is exceeded along three quarters of its length.
-    support : part of the walls at which the picture has the profile of the others, 0 to 1.
-    gap_px : longest piece of the walls without that profile.
-    explained : part of the picture's edges that are such walls, less what chance would give; at most 1.
-    rough_px : root mean square distance by which single pieces of the walls are off the smooth outline.
-    clear : how much the wall is what `walls` says, 0 to 1: height of the line or of the step, relative to all of f.
-    line_px : width of the lines that walls are, at half of their height; 0 of steps.
-    between_px : distance between the wall and a line of the other brightness beside it, if nearly as strong; else 0.
-    """
-
-    curves: tuple[Floats, ...]
-    size_px: tuple[int, int]
-    walls: Walls
-    width_px: float
-    support: float
-    gap_px: float
-    explained: float
-    rough_px: float
+    curves: tuple[Floats, ...]  # closed polygons (n, 2), x, y in pixels; they go on beyond the picture's border
+    size_px: tuple[int, int]  # width and height of the picture
+    walls: Walls  # what a wall looks like
+    width_px: float  # width of the channel that is exceeded along three quarters of its length
+    support: float  # part of the walls at which the picture has the profile of the others, 0 to 1
+    gap_px: float  # longest piece of the walls without that profile
+    explained: float  # part of the picture's edges that are such walls, less what chance would give; at most 1
+    rough_px: float  # root mean square distance by which single pieces of the walls are off the smooth outline
+    # how much the wall is what `walls` says, 0 to 1: height of the line or of the step, relative to all of f
     clear: float
-    line_px: float
+    line_px: float  # width of the lines that walls are, at half of their height; 0 of steps
+    # distance between the wall and a line of the other brightness beside it, if nearly as strong; else 0
     between_px: float
 
     def mask(self, finer: float = 1.0) -> Mask:

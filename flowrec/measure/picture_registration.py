@@ -22,15 +22,7 @@ from flowrec.core import ChipError, Image
 from flowrec.measure.images import Colours, Mask, with_curves
 from flowrec.measure.wall_fit import Fitter, WallFit
 from flowrec.measure.wall_search import WallMap, WallSearch
-from flowrec.physics import (
-    AS_STATED,
-    ORIENTATIONS,
-    Calibration,
-    Chip,
-    Orientation,
-    camera_settings,
-    median_width_um,
-)
+from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, Chip, Orientation, camera_settings, median_width_um
 
 _CANDIDATES = 12  # coarse poses that are fitted at most, the best first
 _LEAST_SCORE = 0.55  # of a candidate, relative to the best one
@@ -90,11 +82,8 @@ def register(
 ) -> tuple[WallFit, ...]:
     """The poses of a chip that explain a picture (h, w) equally well, best first; usually one.
 
-    `um_per_px` is the range that is searched, `mirrors` says whether mirror images are.
-
-    Raises
-    ------
-    ChipError : one line: the picture does not show this chip, or does not determine how it lies.
+    `um_per_px` is the range that is searched, `mirrors` says whether mirror images are. Raises ChipError: one line: the
+    picture does not show this chip, or does not determine how it lies.
     """
     if _is_small(picture):
         least = f"{_LEAST_PX} x {_LEAST_PX}"
@@ -205,15 +194,10 @@ def overlay(picture: Image, chip: Chip, calibration: Calibration) -> Colours:
 
 
 class ImageVerdict(NamedTuple):
-    """Result of the comparison of the axes with a picture.
+    """Result of the comparison of the axes with a picture."""
 
-    Attributes
-    ----------
-    contradiction : one line with the settings to paste; '' if there is none.
-    alike : the orientations in the image that it shows equally well; () if it does not show enough of the walls.
-    """
-
-    contradiction: str
+    contradiction: str  # one line with the settings to paste; '' if there is none
+    # the orientations in the image that it shows equally well; () if it does not show enough of the walls
     alike: tuple[Orientation, ...]
 
     @property

@@ -48,18 +48,11 @@ _LEAST_AREA, _MOST_AREA = 0.005, 0.75  # of the channel, relative to the picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segmentation:
-    """A channel.
+    """A channel."""
 
-    Attributes
-    ----------
-    outline : its walls, in pixels of the picture.
-    shown : how the walls show.
-    agreed : share of what looks like a wall that is a wall of this channel; 1 where fluid shows, not walls.
-    """
-
-    outline: Outline
-    shown: Shown
-    agreed: float
+    outline: Outline  # its walls, in pixels of the picture
+    shown: Shown  # how the walls show
+    agreed: float  # share of what looks like a wall that is a wall of this channel; 1 where fluid shows, not walls
 
     @property
     def quality(self) -> float:
@@ -105,16 +98,14 @@ class Segmentation:
 def segment(picture: Image, shown: Shown = "auto", seeds_px: Sequence[tuple[float, float]] = ()) -> Segmentation:
     """The channel in a picture (h, w).
 
+    Raises ChipError: one line: nothing in the picture is surely a channel, several things may be one, or the points
+    contradict what is seen.
+
     Parameters
     ----------
     shown : how the walls show; auto: all of these are tried.
     seeds_px : points x, y in the channel. Without any the channel is the side of the walls that does not hold the
         corners of the picture; with them it is what is connected with one of them.
-
-    Raises
-    ------
-    ChipError : one line: nothing in the picture is surely a channel, several things may be one, or the points
-        contradict what is seen.
     """
     full = np.asarray(picture, np.float32)
     height, width = full.shape

@@ -96,11 +96,7 @@ def tune(
     """Position noise while the robot was parked, then the agility for which the mean NIS is 2.
 
     Position noise that is stated too large makes the NIS too small for any agility, so it is determined first. With
-    `fields`, kalman_map is tuned.
-
-    Raises
-    ------
-    UsageError : the recording is too short.
+    `fields`, kalman_map is tuned. Raises UsageError: the recording is too short.
     """
 
     def mean_nis(kalman: Kalman) -> float:

@@ -56,26 +56,16 @@ _LEAST_ALL = 200  # pixels of a fit
 
 
 class WallFit(NamedTuple):
-    """A pose with all that is known of its quality.
+    """A pose with all that is known of its quality."""
 
-    Attributes
-    ----------
-    calibration : the pose.
-    explained : relative variance of the grey levels near the walls that f explains.
-    found : part of the walls in the image that look like the others, 0 to 1.
-    seen : part of the chip's walls that the image shows.
-    residual_um : root mean square distance of the walls of the patches from where the pose puts them.
-    std : (4,) standard errors: shift of the image's centre along x and y in um, angle in degrees, relative scale.
-    apart : (4,) the part of them that is the difference of the two readings; 0 where only one of them counts.
-    """
-
-    calibration: Calibration
-    explained: float
-    found: float
-    seen: float
-    residual_um: float
+    calibration: Calibration  # the pose
+    explained: float  # relative variance of the grey levels near the walls that f explains
+    found: float  # part of the walls in the image that look like the others, 0 to 1
+    seen: float  # part of the chip's walls that the image shows
+    residual_um: float  # root mean square distance of the walls of the patches from where the pose puts them
+    # (4,) standard errors: shift of the image's centre along x and y in um, angle in degrees, relative scale
     std: Floats
-    apart: Floats
+    apart: Floats  # (4,) the part of them that is the difference of the two readings; 0 where only one of them counts
 
 
 class Fitter:

@@ -224,11 +224,8 @@ class WallSearch:
     def agreement(self, calibration: Calibration, number: int = 0) -> float:
         """Agreement of wall directions at one pose, which may be off by some 4 of 480 pixels.
 
-        It is the mean at the points in the image, times the root of their number relative to all.
-
-        Parameters
-        ----------
-        number : of the map of the image; the second one is finer.
+        It is the mean at the points in the image, times the root of their number relative to all. `number`: of the map
+        of the image; the second one is finer.
         """
         z = self._maps[number]
         at = (calibration.to_px(self._points_um) + 0.5) / self._fine - 0.5

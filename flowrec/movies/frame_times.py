@@ -16,22 +16,14 @@ _MOST_IMAGES = 1 << 40  # a larger number of an image is no number of an image, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTimes:
-    """Times of the images of one movie, on the clock of the log if that is known.
+    """Times of the images of one movie, on the clock of the log if that is known."""
 
-    Attributes
-    ----------
-    text : where the times come from.
-    times_ns : (n,) of the images in order; None: by the rate, or by each image itself.
-    numbers : (n,) the camera's numbers of the images, by which gaps are losses; None: they are counted.
-    rate_hz : None: not by a rate.
-    exact : `times_ns` has exactly as many rows as there are images.
-    """
-
-    text: str
-    times_ns: NDArray[np.int64] | None = None
+    text: str  # where the times come from
+    times_ns: NDArray[np.int64] | None = None  # (n,) of the images in order; None: by the rate, or by each image itself
+    # (n,) the camera's numbers of the images, by which gaps are losses; None: they are counted
     numbers: NDArray[np.int64] | None = None
-    rate_hz: float | None = None
-    exact: bool = False
+    rate_hz: float | None = None  # None: not by a rate
+    exact: bool = False  # `times_ns` has exactly as many rows as there are images
 
     def of(self, place: int, time_ns: int | None, where: Path) -> tuple[int, int]:
         """Time and number of the image at a place, to which the file gives `time_ns`; MovieError if there is none."""
@@ -49,15 +41,14 @@ class FrameTimes:
 def frame_times(path: Path, facts: MovieFacts, table: str = "", rate_hz: float | None = None) -> FrameTimes:
     """The times of a movie.
 
+    Raises MovieError: in one line: no times at all, both kinds of them, times that go back, more or fewer rows than
+    images.
+
     Parameters
     ----------
     table : CSV or Excel file with a column time_s (other units, dates: see `Table.times_s`) and a row
         for each image in order; '': none. A column frame holds the camera's own numbers, so that a gap is a loss.
     rate_hz : images per second, instead.
-
-    Raises
-    ------
-    MovieError : in one line: no times at all, both kinds of them, times that go back, more or fewer rows than images.
     """
     if table and rate_hz is not None:
         raise MovieError(f"{path}: times are given by {table} and by a rate; give one of --times and --fps")

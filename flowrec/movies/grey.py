@@ -35,11 +35,8 @@ def refuse_other_type(path: Path, dtype: np.dtype[Any]) -> None:
 def grey_image(array: NDArray[Any], channel: str | None, bits: int, path: Path, index: int) -> Image:
     """Grey levels (h, w) of an image (h, w) or, red first, (h, w, 3 or 4).
 
-    A colour image whose channels are equal is grey. `grey` is the luma of ITU-R BT.601, rounded.
-
-    Raises
-    ------
-    MovieError : colour without a choice, pixels that are no whole numbers of 8 or 16 bit, levels of more than `bits`.
+    A colour image whose channels are equal is grey. `grey` is the luma of ITU-R BT.601, rounded. Raises MovieError:
+    colour without a choice, pixels that are no whole numbers of 8 or 16 bit, levels of more than `bits`.
     """
     dtype = pixel_type(bits)
     refuse_other_type(path, array.dtype)

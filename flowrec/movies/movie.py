@@ -49,17 +49,13 @@ class MovieFrame:
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """Options for reading a movie.
+    """Options for reading a movie."""
 
-    Attributes
-    ----------
-    channel : red, green, blue or grey (luma) of a movie in colour; None: a movie in colour is refused.
-    bits : depth of the pixels, where the file does not tell it; None: that of the file, or of its type.
-    partial : a movie that breaks off, or can not be decoded from some image on, ends there instead of being refused.
-    """
-
+    # red, green, blue or grey (luma) of a movie in colour; None: a movie in colour is refused
     channel: str | None = None
+    # depth of the pixels, where the file does not tell it; None: that of the file, or of its type
     bits: int | None = None
+    # a movie that breaks off, or can not be decoded from some image on, ends there instead of being refused
     partial: bool = False
 
 
@@ -144,9 +140,7 @@ class Movie(ABC):
     def frames(self) -> Iterator[MovieFrame]:
         """All images in order.
 
-        Raises
-        ------
-        MovieError : an image can not be read, and `options.partial` is not set; the text says how many could.
+        Raises MovieError: an image can not be read, and `options.partial` is not set; the text says how many could.
         """
         times = self.facts.times_ns
         for index in range(self.facts.frames):
@@ -188,13 +182,7 @@ class Movie(ABC):
     def _depth(self, kept: int, stated: int | None = None, who: str = "the file does not say how many of its") -> int:
         """The depth of PIXEL_BITS of pixels that are kept in so many bits; the one that was asked for, if any.
 
-        Parameters
-        ----------
-        stated : number of significant bits by the file.
-
-        Raises
-        ------
-        MovieError : more bits than an image can have.
+        `stated`: number of significant bits by the file. Raises MovieError: more bits than an image can have.
         """
         if self.options.bits is not None:
             return self.options.bits

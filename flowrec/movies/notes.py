@@ -76,9 +76,7 @@ class MovieNotes:
 def notes_in(text: str, path: Path) -> MovieNotes | None:
     """The notes in a text of a movie file; None if flowrec has not written it.
 
-    Raises
-    ------
-    MovieError : flowrec has written it, and it is damaged, or of a later version.
+    Raises MovieError: flowrec has written it, and it is damaged, or of a later version.
     """
     if f'"{_KEY}"' not in text[:200] or len(text) > _MOST_CHARACTERS:
         return None

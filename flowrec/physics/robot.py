@@ -42,9 +42,7 @@ class RobotSettings:
     def check(self, where: str) -> None:
         """Refuse a table that does not tell one frequency for each speed.
 
-        Raises
-        ------
-        UsageError : one line, the key first; `where` is the origin of the settings.
+        Raises UsageError: one line, the key first; `where` is the origin of the settings.
         """
         if any(b[0] <= a[0] or b[1] <= a[1] for a, b in pairwise(self.speed_at_hz)):
             raise UsageError(

@@ -41,9 +41,7 @@ class Rig(Protocol):
     def zero(self) -> None:
         """Take the field away now; until the rig is entered again `apply` lets none back. A second call is harmless.
 
-        Raises
-        ------
-        RigError : the hardware has refused; it is called again.
+        Raises RigError: the hardware has refused; it is called again.
         """
 
 
@@ -98,23 +96,15 @@ class Picturing(Protocol):
     """A rig that can show the chip before a run."""
 
     def picture(self) -> Image:
-        """An image of the camera; of a rig with devices while they are connected.
-
-        Raises
-        ------
-        RigError : no image comes.
-        """
+        """An image of the camera; of a rig with devices while they are connected. Raises RigError: no image comes."""
 
 
 def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callable[[], None]) -> Iterator[Inputs]:
     """Inputs whose stamps increase; `rejected` is called for every other one.
 
     The turns of a rejected frame are added to those of the next one, so that no rotation of the field is lost; its
-    messages of extra topics come with the next one.
-
-    Raises
-    ------
-    RigError : 50 frames in a row are rejected: the robot is out of control.
+    messages of extra topics come with the next one. Raises RigError: 50 frames in a row are rejected: the robot is out
+    of control.
     """
     lost: list[Inputs] = []
     for arrived in inputs:
@@ -141,9 +131,7 @@ def _with_lost(arrived: Inputs, lost: list[Inputs]) -> Inputs:
 def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int], bits: int = 8) -> Iterator[Inputs]:
     """The inputs with `applied.image_since_ns` filled in; images must be (height, width) pixels of `image_shape`.
 
-    Raises
-    ------
-    RigError : an image has another size, or another depth than `bits`.
+    Raises RigError: an image has another size, or another depth than `bits`.
     """
     last: Frame | None = None
     since_ns = 0

@@ -46,9 +46,7 @@ class Interrupted(BaseException):
 class RunControl:
     """Events that wait for their tick, and the request to end the run.
 
-    Parameters
-    ----------
-    clock : monotonic time in s.
+    `clock`: monotonic time in s.
 
     Attributes
     ----------
@@ -92,11 +90,8 @@ class RunControl:
     def set_goal(self, x_um: float, y_um: float) -> None:
         """Send the robot to another place on the chip. Of several that wait for their tick the latest counts.
 
-        The mission decides, and records, whether a route leads there; if none does, the goal before stays.
-
-        Raises
-        ------
-        UsageError : not a place that a chip could have.
+        The mission decides, and records, whether a route leads there; if none does, the goal before stays. Raises
+        UsageError: not a place that a chip could have.
         """
         if not (abs(x_um) <= _FARTHEST_UM and abs(y_um) <= _FARTHEST_UM):  # false for NaN
             raise UsageError(f"goal {x_um:g}, {y_um:g} um: both are numbers of at most {_FARTHEST_UM:g} um")
@@ -106,9 +101,7 @@ class RunControl:
     def limit_speed(self, speed_um_s: float | None) -> None:
         """Limit the robot's speed through the fluid, or with None no longer. Of several that wait the latest counts.
 
-        Raises
-        ------
-        UsageError : not a speed of a robot; to make it stand still, hold it.
+        Raises UsageError: not a speed of a robot; to make it stand still, hold it.
         """
         least, most = _SPEEDS_UM_S
         if speed_um_s is not None and not least <= speed_um_s <= most:

@@ -40,9 +40,7 @@ class _HandSample:
 class HandSteering:
     """The latest sample, and who steers.
 
-    Parameters
-    ----------
-    clock : monotonic time in s.
+    `clock`: monotonic time in s.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

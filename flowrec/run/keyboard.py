@@ -33,9 +33,7 @@ _ESCAPE, _ENTER, _RUBOUT, _KILL_LINE = "\x1b", ("\r", "\n"), ("\x7f", "\x08"), "
 class Keyboard:
     """Meaning of the keys, independent of the terminal.
 
-    Attributes
-    ----------
-    note : the note that is being typed; None without one.
+    `note`: the note that is being typed; None without one.
     """
 
     def __init__(self, control: RunControl) -> None:

@@ -110,7 +110,8 @@ def run(
     counted.
 
     Long because one tick's calls stand in the order in which they may fail: the commands after all stages, the sinks
-    after the commands. They share the ticks, the times and the report.
+    after the commands. They share the ticks, the times and the report. Raises RigError: the rig can not go on, or its
+    zero() has failed. Besides, what stages, rig, worker and sinks raise.
 
     Parameters
     ----------
@@ -122,10 +123,6 @@ def run(
     watchdog : that of this rig; None: one without a timer.
     paced : the worker takes real time, and the ticks after the end of the rig wait for it.
     joining : messages and streams of other programs and devices, which join the inputs.
-
-    Raises
-    ------
-    RigError : the rig can not go on, or its zero() has failed. Besides, what stages, rig, worker and sinks raise.
     """
     report = RunReport()
     control = control if control is not None else RunControl()

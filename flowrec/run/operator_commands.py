@@ -19,22 +19,14 @@ GOAL, SPEED, HAND, OUTPUT = "goal", "speed", "hand", "output"  # commands with n
 
 @dataclass(frozen=True, slots=True)
 class OperatorCommand:
-    """A command without numbers.
+    """A command without numbers."""
 
-    Attributes
-    ----------
-    name : a word that identifies it.
-    key : of the terminal and of the console's page.
-    words : what the key does, in the terminal's line of keys and on the console's button.
-    meaning : what it does to the robot and the run.
-    give : takes the control, a text (only a note has one) and how the command was given: a key, or `console`. False,
-        and nothing is done, while too many events wait; None of a command that need not wait.
-    """
-
-    name: str
-    key: str
-    words: str
-    meaning: str
+    name: str  # a word that identifies it
+    key: str  # of the terminal and of the console's page
+    words: str  # what the key does, in the terminal's line of keys and on the console's button
+    meaning: str  # what it does to the robot and the run
+    # takes the control, a text (only a note has one) and how the command was given: a key, or `console`. False, and
+    # nothing is done, while too many events wait; None of a command that need not wait.
     give: Callable[[RunControl, str, str], bool | None]
 
 
@@ -90,10 +82,8 @@ HELP = "keys: " + "   ".join(f"{'space' if row.key == ' ' else row.key} {row.wor
 def obey(control: RunControl, words: dict[str, Any]) -> str:
     """Give a command of the console to the run; why it does not take it, '' where it does.
 
-    Parameters
-    ----------
-    words : `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), `name` and `value` of
-        an output, of a hand what `_steer` takes, else `text`.
+    `words`: `command`, and `x_um` and `y_um` of a goal, `limit_um_s` of a speed (None: no limit), `name` and `value` of
+    an output, of a hand what `_steer` takes, else `text`.
     """
     try:
         name = words["command"]

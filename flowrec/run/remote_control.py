@@ -93,13 +93,8 @@ class CommandSocket:
 class RemoteControl:
     """Commands to a run that another process records.
 
-    Parameters
-    ----------
-    session : X.mcap of the run.
-
-    Raises
-    ------
-    FlowrecError : it can not be steered: it has ended, is of another user or machine, or was begun by an older flowrec.
+    `session`: X.mcap of the run. Raises FlowrecError: it can not be steered: it has ended, is of another user or
+    machine, or was begun by an older flowrec.
     """
 
     def __init__(self, session: Path) -> None:

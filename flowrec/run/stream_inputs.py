@@ -63,6 +63,8 @@ class _Known:
 class StreamInputs:
     """The streams of a configuration, read while it is entered as a context.
 
+    Raises UsageError: a stream that this rig can not have.
+
     Parameters
     ----------
     settings : sections [streams.NAME] by name.
@@ -72,10 +74,6 @@ class StreamInputs:
     log : values of the program that records, for the streams of the kind `log`.
     realtime : the run keeps to the wall clock.
     make : makes the stream of a section, as `stream_of` does.
-
-    Raises
-    ------
-    UsageError : a stream that this rig can not have.
     """
 
     def __init__(
@@ -113,9 +111,7 @@ class StreamInputs:
     def connect(self, stack: ExitStack, read: Mapping[str, str] = MappingProxyType({})) -> None:
         """Find all senders; the stack closes them again.
 
-        Parameters
-        ----------
-        read : the setting that names each channel that a stage reads, by its STREAM/CHANNEL.
+        `read`: the setting that names each channel that a stage reads, by its STREAM/CHANNEL.
 
         Raises
         ------
@@ -248,12 +244,7 @@ def _needs_rig(settings: StreamSettings) -> bool:
 
 
 def stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool) -> SampleStream:
-    """The stream of a section.
-
-    Raises
-    ------
-    UsageError : this rig can not have it.
-    """
+    """The stream of a section. Raises UsageError: this rig can not have it."""
     if _needs_rig(settings):
         if not isinstance(rig, Measuring):
             raise UsageError(f"streams.{name}.kind = {settings.kind!r}: this rig measures nothing; name another kind")

@@ -60,9 +60,7 @@ class StreamCounts:
 class StreamReader:
     """Reads a stream from `start` to `close`.
 
-    Parameters
-    ----------
-    tell : called with one line when the stream ends, comes back, or its clock steps.
+    `tell`: called with one line when the stream ends, comes back, or its clock steps.
     """
 
     def __init__(self, name: str, stream: SampleStream, settings: StreamSettings, tell: Callable[[str], None]) -> None:
@@ -93,9 +91,7 @@ class StreamReader:
     def connect(self) -> None:
         """Find the sender within `wait_s`.
 
-        Raises
-        ------
-        RigError : one line; it is not there and the run must not go on without it, or it can not be used.
+        Raises RigError: one line; it is not there and the run must not go on without it, or it can not be used.
         """
         end_s = time.monotonic() + self.settings.wait_s
         while True:

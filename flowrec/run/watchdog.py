@@ -111,9 +111,7 @@ class Watchdog:
     def running(self) -> Iterator[Watchdog]:
         """Context in which the thread runs; to be entered before the rig.
 
-        Raises
-        ------
-        RigError : the block ends by an exception, of the rig or its driver too, while zero() still fails.
+        Raises RigError: the block ends by an exception, of the rig or its driver too, while zero() still fails.
         """
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self._thread.start()
@@ -132,9 +130,7 @@ class Watchdog:
     def field_off(self) -> None:
         """Switch the field off and wait until it is; an exception of a signal handler is raised when that is done.
 
-        Raises
-        ------
-        RigError : zero() has failed for two seconds; it is still repeated.
+        Raises RigError: zero() has failed for two seconds; it is still repeated.
         """
         self.take_away()
         interrupted: BaseException | None = None

@@ -54,11 +54,8 @@ def work(pipeline: Pipeline, order: Tick) -> Result:
     """Do what `order.mission` wants with what was known in that tick; the result has the order's stamp and number.
 
     A result that is not finite, is made from what is not, or that the numerics can not give, is refused: what is in use
-    stays, and the result says why (`refused`). Where nothing is in use yet the run ends with the error.
-
-    Raises
-    ------
-    FlowrecError : bad settings; nothing is in use that could stay.
+    stays, and the result says why (`refused`). Where nothing is in use yet the run ends with the error. Raises
+    FlowrecError: bad settings; nothing is in use that could stay.
     """
     mission, name = order_of(order)
     try:
@@ -131,11 +128,8 @@ class LockstepWorker:
     """Adopts each result a fixed time after its order: same seed, same session, however fast the machine is.
 
     `schedule` (request number to stamp) overrides the time: a replay adopts where the recording did. Orders whose
-    result goes to a field outside `fills` are ignored (in a replay: their results are recorded).
-
-    Attributes
-    ----------
-    announce : takes what is computed, and '' after it.
+    result goes to a field outside `fills` are ignored (in a replay: their results are recorded). `announce`: takes what
+    is computed, and '' after it.
     """
 
     def __init__(

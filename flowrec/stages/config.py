@@ -196,9 +196,7 @@ _OF_PYDANTIC = re.compile(r"(tuple|str|function)\b")  # parts of the place of an
 
 
 def load_config(
-    path: Path | str | None = None,
-    sets: Mapping[str, Any] | Iterable[str] = (),
-    flags: Mapping[str, str] | None = None,
+    path: Path | str | None = None, sets: Mapping[str, Any] | Iterable[str] = (), flags: Mapping[str, str] | None = None
 ) -> Config:
     """Defaults, then the TOML file, then `sets`: values by key; or texts `key=value`, as TOML or bare words.
 

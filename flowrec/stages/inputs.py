@@ -77,9 +77,7 @@ if {each.name for each in fields(Inputs)} != {"stamp_ns", *FROM_IMAGE, "clock", 
 def with_inputs(last: Tick, inputs: Inputs, topics: TopicTable = FIXED) -> Tick:
     """The tick after `last` before any stage has run: the state of `last` with the new inputs.
 
-    Raises
-    ------
-    RigError : a message of a topic that the run does not declare.
+    Raises RigError: a message of a topic that the run does not declare.
     """
     new: dict[str, Any] = {name: message for name in HELD if (message := getattr(inputs, name)) is not None}
     if inputs.extra:

@@ -92,9 +92,7 @@ def with_row(stage: Any, table: Methods, name: str) -> Any:
 
     >>> with_row(Planner(), PLANNERS, "lab_kit_steps").plan(...)
 
-    Raises
-    ------
-    UsageError : there is no such row, or its package can not be used.
+    Raises UsageError: there is no such row, or its package can not be used.
     """
     row, selector = table[name], table.setting.rpartition(".")[2]
     if row.source is None:
@@ -113,14 +111,12 @@ def key_of_section(setting: str, name: str) -> str:
 def extend_config(root: Any, tree: Mapping[str, Any], recorded: Callable[[str], bool] | None = None) -> Any:
     """The configuration class with the sections of all rows of others that a tree of settings names.
 
+    Raises UsageError: a package can not be used, or its name is taken.
+
     Parameters
     ----------
     root : our configuration class.
     recorded : whether a section is one of a session, which has to be readable without its package.
-
-    Raises
-    ------
-    UsageError : a package can not be used, or its name is taken.
     """
     more: dict[str, dict[str, Any]] = {}
     unread: dict[str, dict[str, Any]] = {}  # the selecting settings whose package is not there, with their types
@@ -268,9 +264,7 @@ def needed_packages(config: Any, provenance: Mapping[str, str]) -> list[str]:
 def other_packages(config: Any, provenance: Mapping[str, str]) -> list[str]:
     """Differences of a replay's stages from the recorded ones in packages of others: a line each.
 
-    Raises
-    ------
-    UsageError : a package that a stage needs is not installed, or does not take the recorded settings.
+    Raises UsageError: a package that a stage needs is not installed, or does not take the recorded settings.
     """
     lines, known = [], outside_facts(provenance)
     for setting, table, name, settings in of_stages(config):

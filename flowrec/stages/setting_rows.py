@@ -27,24 +27,14 @@ _WIDTH = 96  # of the comments
 
 @dataclass(frozen=True, slots=True)
 class SettingRow:
-    """One setting.
+    """One setting."""
 
-    Attributes
-    ----------
-    key : as typed with --set.
-    default : its value where nothing else is stated; None: not stated, then derived or not used.
-    valid : type, range or choices, as text.
-    unit : that the end of its name states, "" for none.
-    meaning : of the value, and why the default is what it is.
-    read_by : methods of the stage that read it; none: all.
-    """
-
-    key: str
-    default: Any
-    valid: str
-    unit: str
-    meaning: str
-    read_by: tuple[str, ...] = ()
+    key: str  # as typed with --set
+    default: Any  # its value where nothing else is stated; None: not stated, then derived or not used
+    valid: str  # type, range or choices, as text
+    unit: str  # that the end of its name states, "" for none
+    meaning: str  # of the value, and why the default is what it is
+    read_by: tuple[str, ...] = ()  # methods of the stage that read it; none: all
 
     def lines(self) -> list[str]:
         """As text: the default, the meaning, what is valid and who reads it."""

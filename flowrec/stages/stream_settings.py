@@ -28,10 +28,7 @@ STREAM_KINDS = Methods(
     group="flowrec.streams",
     verb="of",
 )
-STREAM_TOPICS = (
-    Topic(SAMPLES, Source.RIG, type=Samples),
-    Topic(STREAMS, Source.RIG, type=StreamStates),
-)
+STREAM_TOPICS = (Topic(SAMPLES, Source.RIG, type=Samples), Topic(STREAMS, Source.RIG, type=StreamStates))
 PUMP_TOPIC = Topic(PUMP, Source.STAGE, 1e-6, type=PumpShare)
 
 

@@ -92,22 +92,17 @@ class Audit:
 
 
 def audit(
-    path: Path,
-    see: See,
-    progress: Callable[[int], None] | None = None,
-    begin: Callable[[Audit], None] | None = None,
+    path: Path, see: See, progress: Callable[[int], None] | None = None, begin: Callable[[Audit], None] | None = None
 ) -> Audit:
     """Read everything that can be read, in file order; one chunk is in memory at a time.
+
+    Raises SessionError: it is no session, or none that this flowrec can read; its text says what it is.
 
     Parameters
     ----------
     see : receives every message that can be decoded; those of one tick need not follow each other.
     progress : receives the byte up to which the file has been read.
     begin : receives what the head says, before the first message.
-
-    Raises
-    ------
-    SessionError : it is no session, or none that this flowrec can read; its text says what it is.
     """
     why_not = ""
     try:
@@ -142,9 +137,7 @@ def audit(
 def digest_faults(path: Path) -> dict[Path, list[str] | None]:
     """Read all files of a session and compare them with their digests: what differs by file; None: it has no digest.
 
-    Raises
-    ------
-    SessionError : a file can not be read.
+    Raises SessionError: a file can not be read.
     """
     found: dict[Path, list[str] | None] = {}
     for file in files_of(path):

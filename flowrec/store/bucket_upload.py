@@ -41,46 +41,27 @@ class StoreError(SessionError):
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """Size and hashes of a file.
+    """Size and hashes of a file."""
 
-    Attributes
-    ----------
-    size : in bytes.
-    sha256 : of all bytes.
-    etag : that S3 gives to an object that was sent in parts of our size.
-    """
-
-    size: int
-    sha256: str
-    etag: str
+    size: int  # in bytes
+    sha256: str  # of all bytes
+    etag: str  # that S3 gives to an object that was sent in parts of our size
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A file that has become an object.
+    """A file that has become an object."""
 
-    Attributes
-    ----------
-    content : of the file.
-    sent_bytes : what was sent now; less than the size where an upload was resumed.
-    etag : that the store gave to the object.
-    """
-
-    content: Content
-    sent_bytes: int
-    etag: str
+    content: Content  # of the file
+    sent_bytes: int  # what was sent now; less than the size where an upload was resumed
+    etag: str  # that the store gave to the object
 
 
 class LocalParts:
     """A file, in the parts in which it is sent.
 
-    Attributes
-    ----------
-    content : of the file, once `read_all` has come to its end.
-
-    Raises
-    ------
-    SessionError : it can not be read, or changes while it is read.
+    `content`: of the file, once `read_all` has come to its end. Raises SessionError: it can not be read, or changes
+    while it is read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -140,10 +121,8 @@ def content_of_file(path: Path, progress: Callable[[int], None] = lambda _: None
 class Bucket:
     """A folder in a bucket of S3 that files are sent to; credentials and endpoint come from the environment.
 
-    Raises
-    ------
-    UsageError : the extra `remote` is not installed.
-    StoreError : from any method: the bucket can not be written, in one line.
+    Raises UsageError: the extra `remote` is not installed; StoreError: from any method: the bucket can not be written,
+    in one line.
     """
 
     def __init__(self, folder: UrlPath) -> None:
@@ -173,9 +152,7 @@ class Bucket:
     def upload(self, path: Path, progress: Callable[[int], None]) -> Sent | None:
         """Send a file; None if there is an object of its name already.
 
-        Parameters
-        ----------
-        progress : takes the bytes of the file that the bucket has.
+        `progress`: takes the bytes of the file that the bucket has.
         """
         name = path.name
         with closing(LocalParts(path)) as parts:

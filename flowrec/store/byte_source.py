@@ -22,15 +22,13 @@ if TYPE_CHECKING:
 class LocalFile:
     """A file on this machine, whose bytes are read by range, from several threads at a time; see RemoteFile, too.
 
+    Raises SessionError: it can not be opened.
+
     Attributes
     ----------
     path : its name, for messages.
     size : number of bytes when it was opened.
     is_far : a request for each range takes a round trip, so ranges next to each other are worth an effort.
-
-    Raises
-    ------
-    SessionError : it can not be opened.
     """
 
     is_far = False
@@ -55,9 +53,7 @@ class LocalFile:
     def read(self, offset: int, length: int) -> bytes:
         """The bytes of a range that lies within `size`; fewer where the file has become shorter.
 
-        Raises
-        ------
-        SessionError : it can not be read, or has been closed.
+        Raises SessionError: it can not be read, or has been closed.
         """
         if not self._closer.alive:
             raise SessionError(f"{self.path}: has been closed; open the session again")
@@ -90,12 +86,7 @@ class LocalFile:
 
 
 def open_bytes(path: Path) -> LocalFile | RemoteFile:
-    """The bytes that a path or URL names.
-
-    Raises
-    ------
-    SessionError : they can not be opened.
-    """
+    """The bytes that a path or URL names. Raises SessionError: they can not be opened."""
     if not isinstance(path, UrlPath):
         return LocalFile(path)
     from flowrec.store.remote_file import RemoteFile
@@ -106,9 +97,7 @@ def open_bytes(path: Path) -> LocalFile | RemoteFile:
 def is_there(path: Path) -> bool:
     """True if a path or URL names a file, which is not opened if it is on this machine.
 
-    Raises
-    ------
-    SessionError : a server does not say.
+    Raises SessionError: a server does not say.
     """
     if not isinstance(path, UrlPath):
         return path.exists()

@@ -95,9 +95,7 @@ VIEWED = frozenset(view.path for view in VIEWER_TOPICS)
 def slots_of(topics: TopicTable) -> dict[str, Slot]:
     """The slots of all topics of a file by path; those of extra topics follow ours.
 
-    Raises
-    ------
-    UsageError : an extra topic has the path of a viewer topic.
+    Raises UsageError: an extra topic has the path of a viewer topic.
     """
     slots = dict(SLOTS)
     for number, topic in enumerate(topics.extra, len(SLOTS) + 1):
@@ -134,9 +132,7 @@ def is_left_out(path: str, patterns: Iterable[str]) -> bool:
 def left_out(patterns: Iterable[str], topics: TopicTable = FIXED) -> frozenset[str]:
     """The topics that match names or patterns; `/view/*` matches all viewer topics, also those under the images' topic.
 
-    Raises
-    ------
-    UsageError : a pattern matches no topic, or one without which the session could not be replayed.
+    Raises UsageError: a pattern matches no topic, or one without which the session could not be replayed.
     """
     chosen: set[str] = set()
     # A replay continues from what the stages recorded; without images it takes the tracks as they were recorded.
@@ -204,12 +200,7 @@ class SessionContents(SessionMetadata):
         return TopicTable(declared.values()) if declared else FIXED
 
     def decode(self, record: Record) -> Any:
-        """The message in a record of a known topic.
-
-        Raises
-        ------
-        SessionError : it is damaged.
-        """
+        """The message in a record of a known topic. Raises SessionError: it is damaged."""
         kind = self.topics.by_field[self.fields[record.channel]].type
         codec, start_unix_ns = self.codecs[record.channel], self.source.start_unix_ns
         message = decode(kind, codec, record.payload, record.sequence, start_unix_ns)

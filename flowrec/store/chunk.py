@@ -74,11 +74,8 @@ class MessageIndexes:
 class ChunkBuilder:
     """Collects messages in order of time; `seal` empties it.
 
-    The memory is reused from chunk to chunk: a new one for each image costs as much as copying the image.
-
-    Parameters
-    ----------
-    compressed : with zstd; otherwise the chunk is stored as it is, for content that is compressed already.
+    The memory is reused from chunk to chunk: a new one for each image costs as much as copying the image. `compressed`:
+    with zstd; otherwise the chunk is stored as it is, for content that is compressed already.
     """
 
     def __init__(self, *, compressed: bool = True) -> None:
@@ -166,9 +163,7 @@ class ChunkEncoder:
     def add(self, entry: Entry) -> None:
         """Take the messages of one tick; pass full chunks to `sink`.
 
-        Raises
-        ------
-        SessionError : an image that can not be encoded; and what `sink` raises.
+        Raises SessionError: an image that can not be encoded; and what `sink` raises.
         """
         for field, message in entry.messages.items():
             if isinstance(message, Frame):

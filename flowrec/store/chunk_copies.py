@@ -21,15 +21,7 @@ from flowrec.store.channels import SLOTS, VIEWED, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.gathered_copies import is_copy
-from flowrec.store.mcap_format import (
-    CHUNK_HEAD,
-    LONG,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
-    Record,
-    SealedChunk,
-    records_in,
-)
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, Record, SealedChunk, records_in
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.scan import Scan
 from flowrec.store.session_metadata import DIGEST, OUTCOME
@@ -42,28 +34,18 @@ _COUNTED = ("ticks", "dropped_frames", "frames_dropped")  # the last one in olde
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """Amount of a session that is kept, and what was lost.
+    """Amount of a session that is kept, and what was lost."""
 
-    Attributes
-    ----------
-    ticks : complete ticks without the keyframe of a part.
-    lost_bytes : of the old file, unusable.
-    lost : what was lost, as text; empty when nothing was.
-    outcome : of the recovered session.
-    """
-
-    ticks: int
-    lost_bytes: int
-    lost: str
-    outcome: dict[str, str]
+    ticks: int  # complete ticks without the keyframe of a part
+    lost_bytes: int  # of the old file, unusable
+    lost: str  # what was lost, as text; empty when nothing was
+    outcome: dict[str, str]  # of the recovered session
 
 
 class RecoveryTally:
     """Ticks and messages of a file that are kept, and those that have to be left out; all times are those of ticks.
 
-    Attributes
-    ----------
-    undeclared : messages of channels whose declaration was not found, or is damaged.
+    `undeclared`: messages of channels whose declaration was not found, or is damaged.
     """
 
     def __init__(self, contents: SessionContents) -> None:
@@ -162,20 +144,14 @@ def _array(times: array[int]) -> NDArray[np.int64]:
 class ChunkCopier:
     """Copies chunk after chunk while a file is scanned.
 
+    `draws`: the viewer topics are not copied, but made again from what is kept. Those of another flowrec, which has
+    declared them otherwise, stay. Raises OSError: from any method, when the disk refuses.
+
     Parameters
     ----------
     contents : the file, with all that is declared in it.
     out : the new file, not begun.
     tally : receives what is kept and what is left out.
-
-    Attributes
-    ----------
-    draws : the viewer topics are not copied, but made again from what is kept. Those of another flowrec, which has
-        declared them otherwise, stay.
-
-    Raises
-    ------
-    OSError : from any method, when the disk refuses.
     """
 
     def __init__(self, contents: SessionContents, out: McapWriter, tally: RecoveryTally) -> None:

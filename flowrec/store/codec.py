@@ -60,19 +60,12 @@ _OPERATOR_NAME = "operator."
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """Encoding of one message type.
+    """Encoding of one message type."""
 
-    Attributes
-    ----------
-    schema : protobuf schema of the payload.
-    encode : message -> parts of the payload, in order; large arrays are not copied.
-    decode : payload, MCAP sequence -> message.
-    has_unix_time : the schema is one of foxglove's, whose `timestamp` is Unix time; flowrec's own have stamps.
-    """
-
-    schema: Schema
-    encode: Callable[[Any], Payload]
-    decode: Callable[[bytes | memoryview, int], Any]
+    schema: Schema  # protobuf schema of the payload
+    encode: Callable[[Any], Payload]  # message -> parts of the payload, in order; large arrays are not copied
+    decode: Callable[[bytes | memoryview, int], Any]  # payload, MCAP sequence -> message
+    # the schema is one of foxglove's, whose `timestamp` is Unix time; flowrec's own have stamps
     has_unix_time: bool = False
 
 
@@ -99,11 +92,8 @@ def codec_of(message_type: type[Any], path: str = "") -> Codec:
 def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> Encoded:
     """A message as it is stored; large arrays are not copied.
 
-    `start_unix_ns` is the Unix time at which the session clock is 0.
-
-    Raises
-    ------
-    SessionError : a value does not fit the message's declaration, such as an int beyond 64 bit.
+    `start_unix_ns` is the Unix time at which the session clock is 0. Raises SessionError: a value does not fit the
+    message's declaration, such as an int beyond 64 bit.
     """
     stamp_ns = message.stamp_ns
     if start_unix_ns and codec.has_unix_time:
@@ -122,17 +112,13 @@ def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> Encoded
 def decode(
     message_type: type[Any], codec: Codec, payload: bytes | memoryview, sequence: int = 0, start_unix_ns: int = 0
 ) -> Any:
-    """One message from its payload.
+    """One message from its payload. Raises SessionError: the payload is no such message.
 
     Parameters
     ----------
     codec : of the message type.
     sequence : of the MCAP message; it is the index of a Frame.
     start_unix_ns : as in `encode_record`.
-
-    Raises
-    ------
-    SessionError : the payload is no such message.
     """
     try:
         with as_read():
@@ -163,11 +149,8 @@ def byte_field_head(number: int, nbytes: int) -> bytes:
 def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes | memoryview, dict[int, memoryview]]:
     """The message without some of its byte fields, and those fields by number.
 
-    They are views of the payload, or copies where a view would keep a much larger buffer in memory.
-
-    Raises
-    ------
-    ValueError : the payload is no message, or has one of the fields twice.
+    They are views of the payload, or copies where a view would keep a much larger buffer in memory. Raises ValueError:
+    the payload is no message, or has one of the fields twice.
     """
     rest: list[memoryview] = []
     found: dict[int, memoryview] = {}

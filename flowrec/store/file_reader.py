@@ -305,17 +305,14 @@ def _merge(
     """The messages of chunks in order of time; those of equal time stay in file order.
 
     flowrec's own chunks of a group follow each other in time. Where other programs have rewritten a file, chunks that
-    overlap are read together and sorted.
+    overlap are read together and sorted. Raises SessionError: a chunk is damaged, or more chunks overlap than fit into
+    memory.
 
     Parameters
     ----------
     decode : what can be done with each record in the threads, where a chunk contains few and large ones: images. It
         returns the record with a message of at most twice its size as payload, or as it was.
     whole : all chunks are wanted, so that they may be announced many at a time.
-
-    Raises
-    ------
-    SessionError : a chunk is damaged, or more chunks overlap than fit into memory.
     """
     waiting = deque(_overlapping(source, sorted(chunks, key=_in_time)))
     running: deque[tuple[list[ChunkIndex], Future[list[_ChunkContent]]]] = deque()

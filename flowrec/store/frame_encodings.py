@@ -74,10 +74,8 @@ def row_differences(image: Image) -> Payload:
 def decode_image(data: bytes | memoryview, bits: int = 8) -> Image:
     """The pixels of a PNG or JPEG file, (h, w) grey levels, uint8 for a depth of 8 bits and uint16 for more.
 
-    Raises
-    ------
-    ValueError : it is neither, it is coloured, its pixels have another size than those of the depth, or it claims more
-        of them than its bytes or the limit allow.
+    Raises ValueError: it is neither, it is coloured, its pixels have another size than those of the depth, or it claims
+    more of them than its bytes or the limit allow.
     """
     data, expected = memoryview(data), pixel_type(bits)
     height, width = _shape_of(data, 8 * expected.itemsize)
@@ -194,20 +192,12 @@ _WIDE_COST = 2.7  # time for a pixel of 16 bit relative to one of 8 bit
 
 @dataclass(frozen=True, slots=True)
 class FrameEncoding:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes
-    ----------
-    name : value of `recording.frames`.
-    compressed_chunks : whether the chunks are compressed.
-    lossless : whether the same pixels are read back.
-    bits : depth of the images.
-    """
-
-    name: str
-    compressed_chunks: bool
-    lossless: bool = True
-    bits: int = 8
+    name: str  # value of `recording.frames`
+    compressed_chunks: bool  # whether the chunks are compressed
+    lossless: bool = True  # whether the same pixels are read back
+    bits: int = 8  # depth of the images
 
     @property
     def codec(self) -> Codec:

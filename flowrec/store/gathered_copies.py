@@ -43,9 +43,7 @@ def is_copy(attachment: str) -> bool:
 class GatheredCopies:
     """Places of the copies in a file; none where it has none, or other ones than its index tells.
 
-    Attributes
-    ----------
-    pieces : ranges that are copied, and the offset of the first copy, by attachment.
+    `pieces`: ranges that are copied, and the offset of the first copy, by attachment.
     """
 
     def __init__(self, listed: Summary) -> None:
@@ -74,9 +72,7 @@ class GatheredCopies:
     def wrong(self, read: Callable[[int, int], bytes]) -> int:
         """Number of ranges that differ from their copies.
 
-        Parameters
-        ----------
-        read : reads the file where its records stand, by offset and length.
+        `read`: reads the file where its records stand, by offset and length.
         """
         wrong = 0
         for ranges, begin in self.pieces:
@@ -94,14 +90,12 @@ def complement(data: bytes) -> bytes:
 def gather(path: Path, listed: Summary, start_unix_ns: int) -> Iterator[Attachment]:
     """The copies of a file that holds all but them, its digest and its index.
 
+    Raises SessionError: the file can not be read back.
+
     Parameters
     ----------
     listed : its index, with Unix times.
     start_unix_ns : Unix time of stamp 0.
-
-    Raises
-    ------
-    SessionError : the file can not be read back.
     """
     with contextlib.closing(open_bytes(path)) as source:
         for name, ranges in _pieces(_ranges(listed)):

@@ -57,13 +57,8 @@ def live_runs() -> list[LiveRun]:
 class GrowingRun:
     """The ticks of a run as they reach its files.
 
-    Parameters
-    ----------
-    path : X.mcap, or any file of that run.
-
-    Raises
-    ------
-    SessionError : it is not being recorded, or keeps only the time around events and none has come.
+    `path`: X.mcap, or any file of that run. Raises SessionError: it is not being recorded, or keeps only the time
+    around events and none has come.
     """
 
     def __init__(self, path: Path) -> None:
@@ -100,9 +95,7 @@ class GrowingRun:
     def ticks(self) -> Iterator[Tick]:
         """The ticks as they come, from the beginning of the present file to the end of the run.
 
-        Raises
-        ------
-        SessionError : the file is damaged, or was not completed: its recorder was killed.
+        Raises SessionError: the file is damaged, or was not completed: its recorder was killed.
         """
         while True:
             self._file.look()
@@ -134,13 +127,7 @@ class GrowingRun:
 class _GrowingFile:
     """One file of the run, indexed as far as it has grown.
 
-    Parameters
-    ----------
-    path : the name that it gets when it is complete.
-
-    Attributes
-    ----------
-    ended : all of it was seen.
+    `path`: the name that it gets when it is complete. `ended`: all of it was seen.
     """
 
     def __init__(self, path: Path) -> None:

@@ -15,16 +15,7 @@ from typing import Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -99,9 +90,7 @@ class Summary:
     def enter(self, record: Schema | Channel | Metadata | Attachment, offset: int, length: int) -> None:
         """Enter a record outside the chunks, which stands at a place in the file.
 
-        Raises
-        ------
-        ValueError : another schema or channel has the same number.
+        Raises ValueError: another schema or channel has the same number.
         """
         if isinstance(record, Metadata):
             self.metadata.append(MetadataIndex(offset, length, record.name))
@@ -130,9 +119,7 @@ class Summary:
     def to_session_clock(self, start_unix_ns: int) -> None:
         """Turn the Unix times of the chunks into stamps of a session that started at `start_unix_ns`.
 
-        Raises
-        ------
-        ValueError : a chunk is before the start.
+        Raises ValueError: a chunk is before the start.
         """
         if not self.chunks or not start_unix_ns:
             return

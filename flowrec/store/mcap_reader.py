@@ -107,13 +107,8 @@ class DamageError(SessionError):
 class McapReader:
     """An MCAP file. Reads are independent of each other and may come from several threads.
 
-    Attributes
-    ----------
-    start_unix_ns : Unix time of stamp 0 of the session, as soon as it has been read; log times are reduced by it.
-
-    Raises
-    ------
-    SessionError : on opening or reading, for every fault of the file.
+    `start_unix_ns`: Unix time of stamp 0 of the session, as soon as it has been read; log times are reduced by it.
+    Raises SessionError: on opening or reading, for every fault of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -133,12 +128,7 @@ class McapReader:
             raise
 
     def set_start(self, unix_ns: int) -> None:
-        """Set `start_unix_ns`.
-
-        Raises
-        ------
-        ValueError : it is no time.
-        """
+        """Set `start_unix_ns`. Raises ValueError: it is no time."""
         if unix_ns >= 1 << 63:
             raise ValueError(f"a session that starts at {unix_ns} ns of Unix time")
         self.start_unix_ns = unix_ns

@@ -36,15 +36,7 @@ from mcap.records import (
 from flowrec.core import SessionError, open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
 from flowrec.store.lookup_record import LOOKUP_OPCODE, SMALL_BYTES, Piece, lookup_record
-from flowrec.store.mcap_format import (
-    CHUNK_HEAD,
-    LONG,
-    MAGIC,
-    RECORD_HEAD,
-    SealedChunk,
-    Summary,
-    parse_summary,
-)
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary, parse_summary
 
 _BUFFERS_PER_WRITE = 1024  # IOV_MAX of Linux
 
@@ -52,11 +44,8 @@ _BUFFERS_PER_WRITE = 1024  # IOV_MAX of Linux
 class McapWriter:
     """An MCAP file open for appending. When a method returns, the operating system has the bytes.
 
-    It is locked until it is closed, so that no other process writes it or takes it for the rest of a killed run.
-
-    Raises
-    ------
-    OSError : from any method, when the disk refuses.
+    It is locked until it is closed, so that no other process writes it or takes it for the rest of a killed run. Raises
+    OSError: from any method, when the disk refuses.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
@@ -218,11 +207,7 @@ def _chunk_head(chunk: SealedChunk) -> bytes:
     """A chunk record up to its data, which would be copied twice by mcap's own builder."""
     name = chunk.compression.encode()
     head = CHUNK_HEAD.pack(
-        chunk.message_start_time,
-        chunk.message_end_time,
-        chunk.uncompressed_size,
-        chunk.uncompressed_crc,
-        len(name),
+        chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size, chunk.uncompressed_crc, len(name)
     )
     head += name + LONG.pack(len(chunk.data))
     return RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(chunk.data)) + head

@@ -27,16 +27,10 @@ _TAG_LIMIT = 60  # characters
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """One note; text and tags are as a person typed them.
+    """One note; text and tags are as a person typed them."""
 
-    Attributes
-    ----------
-    written : time in UTC, ISO 8601.
-    author : name of the user on that machine.
-    """
-
-    written: str
-    author: str
+    written: str  # time in UTC, ISO 8601
+    author: str  # name of the user on that machine
     text: str
     tags: tuple[str, ...] = ()
 
@@ -49,9 +43,7 @@ def notes_file(session: Path) -> Path:
 def read_notes(session: Path, key: str) -> list[Note]:
     """The notes of the session with a key, in order; lines that are damaged or of another session are left out.
 
-    Raises
-    ------
-    SessionError : the file can not be read.
+    Raises SessionError: the file can not be read.
     """
     lines = notes_content(notes_file(session)).split(b"\n")
     notes = (_parse(line, key) for line in lines if 0 < len(line) <= _LINE_LIMIT)
@@ -61,10 +53,7 @@ def read_notes(session: Path, key: str) -> list[Note]:
 def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
     """Write one note behind the others, and onto the disk.
 
-    Raises
-    ------
-    UsageError : there is neither text nor tag, or one is too long.
-    SessionError : the file can not be written.
+    Raises UsageError: there is neither text nor tag, or one is too long; SessionError: the file can not be written.
     """
     tags = tuple(dict.fromkeys(tag.strip() for tag in tags))
     if not text.strip() and not tags:

@@ -36,19 +36,12 @@ _NO_RANGE_TOLD = "can not be read: the server answers 206 without a range"
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The bytes of a range, and of which object.
-
-    Attributes
-    ----------
-    first : offset of the first byte.
-    size : of the whole object in bytes.
-    version : the server's word for this content, its ETag or the time of its last change; '' where it has none.
-    """
+    """The bytes of a range, and of which object."""
 
     data: bytes
-    first: int
-    size: int
-    version: str
+    first: int  # offset of the first byte
+    size: int  # of the whole object in bytes
+    version: str  # the server's word for this content, its ETag or the time of its last change; '' where it has none
 
     @property
     def end(self) -> int:
@@ -90,10 +83,8 @@ class ObjectRequests(ABC):
 def requests_for(url: str, timeout_s: float) -> ObjectRequests:
     """The requests for the object at a URL.
 
-    Raises
-    ------
-    UsageError : the packages of the extra `remote` are not installed, or the URL names a bucket or host alone.
-    SessionError : the URL can not name an object.
+    Raises UsageError: the packages of the extra `remote` are not installed, or the URL names a bucket or host alone;
+    SessionError: the URL can not name an object.
     """
     if not url.partition("://")[2].partition("/")[2]:
         raise UsageError(f"{url}: names no object; name a session in it, as in {url.rstrip('/')}/run.mcap")
@@ -105,26 +96,17 @@ def requests_for(url: str, timeout_s: float) -> ObjectRequests:
 
 @dataclass(frozen=True, slots=True)
 class ListedObject:
-    """An object of a bucket.
+    """An object of a bucket."""
 
-    Attributes
-    ----------
-    name : after the folder that was listed.
-    size : in bytes.
-    version : as of an `Answer`.
-    """
-
-    name: str
-    size: int
-    version: str
+    name: str  # after the folder that was listed
+    size: int  # in bytes
+    version: str  # as of an `Answer`
 
 
 def listing(url: str, begin: str, timeout_s: float) -> list[ListedObject]:
     """The objects of a folder in a bucket, without folders in it, in order of name.
 
-    Parameters
-    ----------
-    begin : only those whose names begin so; few are asked for, however many are in the folder.
+    `begin`: only those whose names begin so; few are asked for, however many are in the folder.
 
     Raises
     ------

@@ -27,8 +27,10 @@ _OPEN_FILES = 4
 class SessionReader:
     """A finished session, open for reading; several iterations may run at a time.
 
-    X.mcap is that file or, where there is none, the run whose parts are X.part001.mcap and so on; a part or a
-    snapshot that is named is opened alone. The parts of a run are read as if it had never been split.
+    X.mcap is that file or, where there is none, the run whose parts are X.part001.mcap and so on; a part or a snapshot
+    that is named is opened alone. The parts of a run are read as if it had never been split. Raises SessionError: there
+    is no such file, it is no session that this flowrec can read, or its parts do not make a whole run; on reading,
+    damage.
 
     Parameters
     ----------
@@ -48,11 +50,6 @@ class SessionReader:
         replay starts. None where the session begins with the run.
     outcome : how the run ended: `outcome`, `reason`, `ticks`, `dropped_frames`, ...; all text, may be empty.
     first_ns, last_ns : stamps of the first and the last tick; both 0 in an empty session.
-
-    Raises
-    ------
-    SessionError : there is no such file, it is no session that this flowrec can read, or its parts do not make a
-        whole run; on reading, damage.
     """
 
     def __init__(self, path: Path | str, run: Run | None = None) -> None:
@@ -160,9 +157,7 @@ class SessionReader:
     def messages(self, field: str) -> Iterator[Any]:
         """All messages of one topic, named by its field of Tick or by its path.
 
-        Raises
-        ------
-        SessionError : no such field, or damage in the file.
+        Raises SessionError: no such field, or damage in the file.
         """
         field = self.field_of(field)
         for file, keyframe_ns in self._files_with({field}):

@@ -111,9 +111,7 @@ class RecorderThread:
 class RecorderProcess:
     """The recorder's process, as the run sees it; see RecorderThread.
 
-    Raises
-    ------
-    SessionError : a file can not be made, or the process does not start.
+    Raises SessionError: a file can not be made, or the process does not start.
     """
 
     def __init__(self, plan: RecordingPlan) -> None:

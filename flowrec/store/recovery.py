@@ -38,15 +38,7 @@ from flowrec.store.run_files import (
 )
 from flowrec.store.scan import Scan, scan
 from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_metadata import (
-    CHIP_FILE,
-    CHIP_IMAGE_FILE,
-    CONFIG_FILE,
-    OUTCOME,
-    PROVENANCE,
-    SESSION,
-    Part,
-)
+from flowrec.store.session_metadata import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, OUTCOME, PROVENANCE, SESSION, Part
 from flowrec.store.session_path import on_this_machine
 from flowrec.store.viewer_pass import draw
 from flowrec.store.viewer_scene import ChipCamera

@@ -233,9 +233,7 @@ def forget(path: Path) -> None:
 def are_there(paths: Sequence[Path]) -> list[bool]:
     """True for each object that can be opened, asked for together; those are opened again without a request.
 
-    Raises
-    ------
-    SessionError : a server does not say.
+    Raises SessionError: a server does not say.
     """
     threads = ThreadPoolExecutor(_TOGETHER)
     try:
@@ -260,13 +258,8 @@ def is_listed(url: Path) -> bool:
 def objects_in(folder: UrlPath, begin: str = "") -> list[tuple[UrlPath, ListedObject]]:
     """The objects of a folder in a bucket, in order of name, and what the listing says of each.
 
-    Parameters
-    ----------
-    begin : only those whose names begin so.
-
-    Raises
-    ------
-    SessionError : the folder can not be listed; MissingError if there is no such bucket, or access is refused.
+    `begin`: only those whose names begin so. Raises SessionError: the folder can not be listed; MissingError if there
+    is no such bucket, or access is refused.
     """
     if not is_listed(folder):
         raise SessionError(f"{folder}: a server of http does not list its files; name the sessions one by one")
@@ -277,13 +270,8 @@ def objects_in(folder: UrlPath, begin: str = "") -> list[tuple[UrlPath, ListedOb
 def files_at(place: UrlPath, suffixes: Sequence[str]) -> list[Path]:
     """The files that a URL names: of a folder, or of a pattern such as `s3://lab/runs/*.mcap`; else itself.
 
-    Parameters
-    ----------
-    suffixes : of the files that are wanted; a URL that ends so is no folder.
-
-    Raises
-    ------
-    SessionError : the folder can not be listed, holds nothing, or a pattern is not in the last part of the URL.
+    `suffixes`: of the files that are wanted; a URL that ends so is no folder. Raises SessionError: the folder can not
+    be listed, holds nothing, or a pattern is not in the last part of the URL.
     """
     if glob.has_magic(str(place.parent)):
         raise SessionError(f"{place}: a pattern at a URL stands after its last slash, as in s3://lab/runs/*.mcap")

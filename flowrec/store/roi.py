@@ -23,20 +23,12 @@ _ROBOT = "robot"
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Rule by which images are reduced to a window around the robot.
+    """Rule by which images are reduced to a window around the robot."""
 
-    Attributes
-    ----------
-    pad_px : how much larger than the region searched (Track.roi_px) a window is on each side.
-    everywhere_px : the searched region of a tracker that looks everywhere; such images stay whole.
-    full_every_s : interval in s at which another image stays whole.
-    cut : False where the images have been cut before, and are recorded as they come.
-    """
-
-    pad_px: int
-    everywhere_px: Window
-    full_every_s: float
-    cut: bool = True
+    pad_px: int  # how much larger than the region searched (Track.roi_px) a window is on each side
+    everywhere_px: Window  # the searched region of a tracker that looks everywhere; such images stay whole
+    full_every_s: float  # interval in s at which another image stays whole
+    cut: bool = True  # False where the images have been cut before, and are recorded as they come
 
     @property
     def notes(self) -> dict[str, str]:

@@ -126,10 +126,8 @@ def _match_name(path: Path) -> tuple[Path, re.Match[str] | None]:
 def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
     """Refuse the output X.mcap as `Output.check` does, and any file of that run, finished or not, in the same way.
 
-    Raises
-    ------
-    OutputError : as `Output.check`.
-    SessionError : the unfinished file of a killed run is there, which `overwrite` would remove.
+    Raises OutputError: as `Output.check`; SessionError: the unfinished file of a killed run is there, which `overwrite`
+    would remove.
     """
     there = run_files(path)
     Output(path, MCAP, tuple(inputs), overwrite).check((*there, partial_path(path)))
@@ -234,9 +232,7 @@ class Run:
 def files_of(path: Path) -> list[Path]:
     """Files that `path` names: itself or, where there is no such file, the parts of the run in order.
 
-    Raises
-    ------
-    SessionError : the run has no end yet, or a part of it is missing.
+    Raises SessionError: the run has no end yet, or a part of it is missing.
     """
     if is_there(path):
         return [path]
@@ -275,9 +271,7 @@ def _refuse_unfinished(path: Path, found: Sequence[Path], partial: Sequence[Path
 def check_continuity(path: Path, run: Sequence[RunFile]) -> None:
     """Check that files are the parts of one run, and that each begins where the one before ends.
 
-    Raises
-    ------
-    SessionError : they do not; one line about the first that does not fit.
+    Raises SessionError: they do not; one line about the first that does not fit.
     """
     for number, file in enumerate(run, 1):
         if (fault := continuity_fault(file, number, run[number - 2] if number > 1 else None)) is not None:

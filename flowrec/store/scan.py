@@ -18,15 +18,7 @@ from mcap.records import ChunkIndex
 from flowrec.core import SessionError
 from flowrec.store.digest import message_digest
 from flowrec.store.lookup_record import LOOKUP_OPCODE
-from flowrec.store.mcap_format import (
-    CHUNK_HEAD,
-    CHUNK_LIMIT_BYTES,
-    DECLARED_LIMIT,
-    MAGIC,
-    RECORD_HEAD,
-    Record,
-    Summary,
-)
+from flowrec.store.mcap_format import CHUNK_HEAD, CHUNK_LIMIT_BYTES, DECLARED_LIMIT, MAGIC, RECORD_HEAD, Record, Summary
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.session_metadata import CONFIG_FILE, OUTCOME
 
@@ -156,16 +148,14 @@ def scan(
 ) -> Scan:
     """Read all of a file and index its intact records; one chunk is in memory at a time.
 
+    Raises SessionError: the file can not be read.
+
     Parameters
     ----------
     visit : receives place and messages of every intact chunk, in file order.
     progress : receives the byte up to which the file has been read.
     digests : sum up the digests of the messages.
     heads_only : pass over the content of chunks: only what is declared outside them is found.
-
-    Raises
-    ------
-    SessionError : the file can not be read.
     """
     source.read_originals()
     found = Scan(source, visit, source.start_unix_ns if digests else None)

@@ -94,6 +94,8 @@ S = TypeVar("S", bound=Segment)
 class SegmentedRun(ABC, Generic[S]):
     """The files of a run while they are written; each entry goes to the segment that it belongs to.
 
+    Raises SessionError: from any method, when the disk refuses, or a message can not be encoded.
+
     Parameters
     ----------
     plan : what is to be recorded; the head of its file is on the disk when the constructor returns.
@@ -104,10 +106,6 @@ class SegmentedRun(ABC, Generic[S]):
     files : the finished ones, in order.
     open : the segments that are not complete; ticks go to the last one, the others wait for images.
     dropped : images that were left out at the end.
-
-    Raises
-    ------
-    SessionError : from any method, when the disk refuses, or a message can not be encoded.
     """
 
     def __init__(self, plan: RecordingPlan, tell: Callable[[str], None]) -> None:
@@ -126,9 +124,8 @@ class SegmentedRun(ABC, Generic[S]):
     def record(self, queue: WriteQueue | QueueReader) -> None:
         """Write what the queue gives until the end of the run, then complete the files, or remove them.
 
-        Raises
-        ------
-        SessionError : the disk refuses, or an image can not be stored; what was written stays in a `.partial` file.
+        Raises SessionError: the disk refuses, or an image can not be stored; what was written stays in a `.partial`
+        file.
         """
         reason = ""
         try:

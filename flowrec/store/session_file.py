@@ -16,16 +16,7 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
-from flowrec.core import (
-    FIXED,
-    SessionError,
-    TopicTable,
-    __version__,
-    name_taken,
-    put_in_place,
-    seconds,
-    sync_directory,
-)
+from flowrec.core import FIXED, SessionError, TopicTable, __version__, name_taken, put_in_place, seconds, sync_directory
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
@@ -45,16 +36,11 @@ _POLL_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Limits at which a part of a run is finished and the next one begins. With neither limit, a run is in one file.
+    """Limits at which a part of a run is finished and the next one begins. With neither limit, a run is in one file."""
 
-    Attributes
-    ----------
-    megabytes : about the size of a part, in MB. A part whose keyframe alone is as large becomes twice as large.
-    seconds : length of a part, in s of stamps.
-    """
-
+    # about the size of a part, in MB. A part whose keyframe alone is as large becomes twice as large.
     megabytes: float | None = None
-    seconds: float | None = None
+    seconds: float | None = None  # length of a part, in s of stamps
 
     def __bool__(self) -> bool:
         return bool(self.megabytes or self.seconds)
@@ -77,48 +63,36 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class WriterOptions:
-    """Options of a recording; the section [recording] of the configuration, resolved.
+    """Options of a recording; the section [recording] of the configuration, resolved."""
 
-    Attributes
-    ----------
-    frames : encoding of the images, a name of frame_encodings.py: raw, zstd, png, delta, or jpeg, which alone is lossy.
-    flush_s : longest end of a run, in s of stamps, that is lost when the process is killed; without `block` also in s
-        of wall time. Images that wait for a slow disk, at most `queue_limit_bytes`, are lost in addition.
-    sync_s : the same for a power failure, as long as an fsync takes less than half of it.
-    overwrite : replace all files of an earlier run of this name, once the new one is complete.
-    block : what to do when the disk is slower than the run. True: `write` waits (simulation), also while more than
-        `flush_s` of stamps is not yet with the operating system. False: images are decimated (write_queue.py) and
-        counted; nothing else is ever dropped (live run).
-    queue_limit_bytes : size of the queue to the recorder.
-    files : a Split: the run X.mcap is written to the files X.part001.mcap, X.part002.mcap, ..., each of which is
-        readable alone; a Snapshot: nothing is written but X.snap001.mcap, ... around events.
-    region : record only the window around the robot of most images (roi.py); None: all of all images.
-    leave_out : topics that are not recorded, as names or patterns such as `/view/*`.
-    bits : depth of the images; another one is refused.
-    keep_failed : False: a session that an exception ends leaves no file, and what `overwrite` would replace stays.
-    clock : monotonic time in s, by which data is flushed and synced.
-    topics : those of the run.
-    accept_losses : a run whose recorder fails goes on; `close` raises the failure. False: `write` raises it.
-    own_process : record in a process of its own, which finishes the files however the run ends.
-    start_by_clocks : stamp 0 is at the time of day that the first tick's /run/clocks says; the header's is a guess.
-    """
-
+    # encoding of the images, a name of frame_encodings.py: raw, zstd, png, delta, or jpeg, which alone is lossy
     frames: str = "zstd"
+    # longest end of a run, in s of stamps, that is lost when the process is killed; without `block` also in s of wall
+    # time. Images that wait for a slow disk, at most `queue_limit_bytes`, are lost in addition.
     flush_s: float = 0.5
-    sync_s: float = 1.0
-    overwrite: bool = False
+    sync_s: float = 1.0  # the same for a power failure, as long as an fsync takes less than half of it
+    overwrite: bool = False  # replace all files of an earlier run of this name, once the new one is complete
+    # what to do when the disk is slower than the run. True: `write` waits (simulation), also while more than `flush_s`
+    # of stamps is not yet with the operating system. False: images are decimated (write_queue.py) and counted; nothing
+    # else is ever dropped (live run).
     block: bool = False
-    queue_limit_bytes: int = 256 << 20
+    queue_limit_bytes: int = 256 << 20  # size of the queue to the recorder
+    # a Split: the run X.mcap is written to the files X.part001.mcap, X.part002.mcap, ..., each of which is readable
+    # alone; a Snapshot: nothing is written but X.snap001.mcap, ... around events.
     files: Split | Snapshot = Split()
+    # record only the window around the robot of most images (roi.py); None: all of all images
     region: Region | None = None
-    leave_out: tuple[str, ...] = ()
-    bits: int = 8
+    leave_out: tuple[str, ...] = ()  # topics that are not recorded, as names or patterns such as `/view/*`
+    bits: int = 8  # depth of the images; another one is refused
+    # False: a session that an exception ends leaves no file, and what `overwrite` would replace stays
     keep_failed: bool = True
-    clock: Callable[[], float] = time.monotonic
+    clock: Callable[[], float] = time.monotonic  # monotonic time in s, by which data is flushed and synced
+    # a run whose recorder fails goes on; `close` raises the failure. False: `write` raises it.
     accept_losses: bool = False
-    own_process: bool = False
+    own_process: bool = False  # record in a process of its own, which finishes the files however the run ends
+    # stamp 0 is at the time of day that the first tick's /run/clocks says; the header's is a guess
     start_by_clocks: bool = False
-    topics: TopicTable = FIXED
+    topics: TopicTable = FIXED  # those of the run
 
     @property
     def left_out_topics(self) -> frozenset[str]:
@@ -147,7 +121,8 @@ class SessionFile:
     Data older than `flush_s`, in wall time or in stamps, has been passed to the operating system. Data older than
     `sync_s` is on the disk, as long as one fsync takes less than half of that. The fsync runs in a side thread: on a
     busy disk it may take a second, in which a camera would fill the queue. That thread writes, too, what would delay
-    the caller: a keyframe, and with a `limit_bytes` all chunks. What is put later than that waits for it.
+    the caller: a keyframe, and with a `limit_bytes` all chunks. What is put later than that waits for it. Raises
+    FileError: from any method, when the disk refuses; what fails in the side thread is raised by `check`.
 
     Parameters
     ----------
@@ -163,10 +138,6 @@ class SessionFile:
     first_bytes : size of header and keyframe.
     failure : the first error, after which nothing is written; `flowrec recover` reads what was written before.
     completion : that of `complete` in another thread, once the file has received all that belongs into it.
-
-    Raises
-    ------
-    FileError : from any method, when the disk refuses; what fails in the side thread is raised by `check`.
     """
 
     def __init__(

@@ -52,21 +52,14 @@ class Part:
 
     Every file but the first starts with a keyframe: the full state at the last tick before it, at that tick's stamp.
     It makes the file readable alone; readers of the whole run skip it.
-
-    Attributes
-    ----------
-    run : the same random word in all files of a run.
-    number : from 1.
-    kind : "part" of a run that was split, or "snapshot", each of which is complete in itself.
-    keyframe_ns : stamp of the keyframe; None where the run itself begins. Its key in the file is `carried_ns`.
-    why : the event that a snapshot was taken for.
     """
 
-    run: str
-    number: int
-    kind: str = "part"
+    run: str  # the same random word in all files of a run
+    number: int  # from 1
+    kind: str = "part"  # "part" of a run that was split, or "snapshot", each of which is complete in itself
+    # stamp of the keyframe; None where the run itself begins. Its key in the file is `carried_ns`.
     keyframe_ns: int | None = None
-    why: str = ""
+    why: str = ""  # the event that a snapshot was taken for
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +158,8 @@ def is_header_file(name: str) -> bool:
 class SessionMetadata:
     """The index and the metadata of a session file.
 
+    Raises SessionError: it is no session file, or not one for this flowrec.
+
     Parameters
     ----------
     path : the file.
@@ -180,10 +175,6 @@ class SessionMetadata:
     flowrec_version : of the program that wrote it.
     digest : of the content, as it was recorded (digest.py); None in files of the first release.
     channels, schemas, attachments, metadata : what else is listed.
-
-    Raises
-    ------
-    SessionError : it is no session file, or not one for this flowrec.
     """
 
     def __init__(self, path: Path, summary: Summary | None = None) -> None:
@@ -307,9 +298,7 @@ class SessionMetadata:
 def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
     """Position of a file in its run, from its metadata records.
 
-    Raises
-    ------
-    ValueError : the values of the record are invalid.
+    Raises ValueError: the values of the record are invalid.
     """
     facts = records.get(PART)
     if facts is None:

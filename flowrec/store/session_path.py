@@ -32,10 +32,8 @@ class UrlPath(_LocalPath):
 def session_path(named: Path | str) -> Path:
     """The path, or the UrlPath where a URL is named.
 
-    Raises
-    ------
-    UsageError : the URL holds a query, a user or a password: those may be credentials, and this name is recorded and
-        printed.
+    Raises UsageError: the URL holds a query, a user or a password: those may be credentials, and this name is recorded
+    and printed.
     """
     text = str(named)
     found = _URL.match(text)

@@ -29,9 +29,7 @@ _LOSSLESS = "zstd"  # for images of a lossy encoding: once more through it they 
 def cut_session(reader: SessionReader, output: Output, from_ns: int, to_ns: int) -> int:
     """Write the ticks from one stamp to another, both included, and return their number.
 
-    Raises
-    ------
-    SessionError : damage in the session, or the disk refuses; then there is no file.
+    Raises SessionError: damage in the session, or the disk refuses; then there is no file.
     """
     config = reader.header.config().recording
     name = config.frames if config.frames in ENCODINGS and ENCODINGS[config.frames].lossless else _LOSSLESS

@@ -35,14 +35,12 @@ _FLUSHED, _WANTED, _DROP, _FILES = range(4)  # words of the ring of the state
 class SharedQueue:
     """The end of the queue in the run; see WriteQueue.
 
+    Raises OSError: the system has not so much memory.
+
     Parameters
     ----------
     limit_bytes : of what waits.
     images : images have a ring of their own, and all memory is taken now; else they are put in with the rest.
-
-    Raises
-    ------
-    OSError : the system has not so much memory.
     """
 
     def __init__(self, limit_bytes: int, *, images: bool) -> None:
@@ -111,10 +109,8 @@ class SharedQueue:
     def put(self, entry: Entry, image: Entry | None = None) -> None:
         """Append an entry, and its image at the lower priority; never blocks.
 
-        Raises
-        ------
-        SessionError : the ring of the state is full, because the recorder has not taken anything for long, or the tick
-            is larger than half of it.
+        Raises SessionError: the ring of the state is full, because the recorder has not taken anything for long, or the
+        tick is larger than half of it.
         """
         if self._abandoned:
             return

@@ -20,18 +20,11 @@ _KEY = re.compile(r"with (\S+ key SHA256:\S+)")
 
 
 class Signature(NamedTuple):
-    """A signature that was verified.
+    """A signature that was verified."""
 
-    Attributes
-    ----------
-    key : kind and fingerprint of the key.
-    signer : as the list of signers names the key; '' without a list, or if the key is not in it.
-    fault : why the signature is not that of the file; '' if it is.
-    """
-
-    key: str = ""
-    signer: str = ""
-    fault: str = ""
+    key: str = ""  # kind and fingerprint of the key
+    signer: str = ""  # as the list of signers names the key; '' without a list, or if the key is not in it
+    fault: str = ""  # why the signature is not that of the file; '' if it is
 
 
 def signature_file(session: Path) -> Path:
@@ -49,9 +42,8 @@ def refuse_unusable_key(key: Path) -> None:
 def sign_file(session: Path, key: Path, *, overwrite: bool) -> Path:
     """Sign a file; the path of the signature. A key with a passphrase asks for it, or is used by its agent.
 
-    Raises
-    ------
-    FlowrecError : the key can not be used, or OpenSSH is not installed; OutputError if there is a signature already.
+    Raises FlowrecError: the key can not be used, or OpenSSH is not installed; OutputError if there is a signature
+    already.
     """
     made = signature_file(session)
     if made.exists() and not overwrite:
@@ -66,13 +58,8 @@ def sign_file(session: Path, key: Path, *, overwrite: bool) -> Path:
 def verify_file(session: Path, signers: Path | None) -> Signature | None:
     """Verify the signature of a file; None: it has none.
 
-    Parameters
-    ----------
-    signers : the keys that are trusted, and whose they are, as of `ssh-keygen(1)`, ALLOWED SIGNERS.
-
-    Raises
-    ------
-    FlowrecError : the list can not be read, or OpenSSH is not installed.
+    `signers`: the keys that are trusted, and whose they are, as of `ssh-keygen(1)`, ALLOWED SIGNERS. Raises
+    FlowrecError: the list can not be read, or OpenSSH is not installed.
     """
     made = signature_file(session)
     if signers is not None and not signers.is_file():

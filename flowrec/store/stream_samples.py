@@ -47,12 +47,7 @@ def units_of(reader: SessionReader) -> dict[str, str]:
 
 
 def channel_of(reader: SessionReader, name: str) -> Channel:
-    """The samples of a channel.
-
-    Raises
-    ------
-    SessionError : there is no such channel; those that there are are named.
-    """
+    """The samples of a channel. Raises SessionError: there is no such channel; those that there are are named."""
     units = units_of(reader)
     if name not in units:
         there = ", ".join(list(units)[:12]) or "none: it was recorded without [streams.NAME]"

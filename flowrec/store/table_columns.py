@@ -54,26 +54,15 @@ _READ_WITH_PIXELS = ("index", "image")  # of a Frame
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column.
+    """One column."""
 
-    Attributes
-    ----------
-    name : with the unit at its end.
-    field : of the message, "" for a column that every table has.
-    component : of a vector field, which this column holds; None: the whole field.
-    kind : int64, float64, float32, bool, string or timestamp: of its values, or of the elements of its lists.
-    shape : of the lists, a letter for a length that changes; () for single values.
-    unit : such as "um/s"; "" for pure numbers, texts, and where it is not the same for all elements.
-    meaning : in words.
-    """
-
-    name: str
-    field: str
-    component: int | None
-    kind: str
-    shape: tuple[int | str, ...]
-    unit: str
-    meaning: str
+    name: str  # with the unit at its end
+    field: str  # of the message, "" for a column that every table has
+    component: int | None  # of a vector field, which this column holds; None: the whole field
+    kind: str  # int64, float64, float32, bool, string or timestamp: of its values, or of the elements of its lists
+    shape: tuple[int | str, ...]  # of the lists, a letter for a length that changes; () for single values
+    unit: str  # such as "um/s"; "" for pure numbers, texts, and where it is not the same for all elements
+    meaning: str  # in words
 
 
 def columns_of(topic: str, topics: TopicTable = FIXED, coils: int = 3) -> tuple[Column, ...]:
@@ -139,18 +128,15 @@ _WANTED = f"the columns are {', '.join(_NAMES[:_NEEDED])} and, where known, {', 
 def observations_of(given: Any, radius_um: float | None = None) -> Observations:
     """Observations from a table with a row each, in the columns OBSERVED.
 
-    Without `std_um_s` it is 5 % of the root mean square speed. A column that may be left out may be empty.
+    Without `std_um_s` it is 5 % of the root mean square speed. A column that may be left out may be empty. Raises
+    UsageError: one line with the shape and the columns that are wanted: a missing column, another shape, no row, NaN or
+    infinity, a standard deviation that is not more than zero.
 
     Parameters
     ----------
     given : path of a CSV or Excel file; a pandas DataFrame, or anything with columns by name; an array (n, 4 to 8) with
         the columns in this order; or Observations, which are returned as they are.
     radius_um : of the robot or particle, which the flow carries as a sphere; None: not stated.
-
-    Raises
-    ------
-    UsageError : one line with the shape and the columns that are wanted: a missing column, another shape, no row, NaN
-        or infinity, a standard deviation that is not more than zero.
     """
     if isinstance(given, Observations):
         return given

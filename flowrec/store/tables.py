@@ -20,17 +20,15 @@ from flowrec.core import (
     Observations,
     SessionError,
     TopicTable,
-    UsageError,
     message_fields,
+    needs,
     unit_of,
     values_of,
 )
 from flowrec.store.table_columns import OBSERVED, STAMP, TIME, WALL, Column, columns_of
 
-try:
+with needs("a table", "export"):
     import pyarrow as pa
-except ModuleNotFoundError as error:
-    raise UsageError("tables need pyarrow, which is not installed: pip install 'flowrec[export]'") from error
 
 _ROWS = 4096
 _BATCH_BYTES = 8 << 20  # an export holds some five times as much: columns, copies, and the pages of its writer
@@ -64,13 +62,7 @@ class Tables:
     def batches(self, rows: Iterable[tuple[str, tuple[Any, ...]]]) -> Iterator[tuple[str, pa.RecordBatch]]:
         """The rows of several topics as record batches of each, in order.
 
-        Parameters
-        ----------
-        rows : topic, by its field of `Tick`, and row.
-
-        Raises
-        ------
-        SessionError : a message has another number of coils.
+        `rows`: topic, by its field of `Tick`, and row. Raises SessionError: a message has another number of coils.
         """
         waiting: dict[str, list[tuple[Any, ...]]] = {}
         nbytes: dict[str, int] = {}
@@ -157,12 +149,7 @@ def observed_flow(observations: Observations) -> pa.Table:
 
 
 def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
-    """A flow field with a row for each pixel of fluid.
-
-    Parameters
-    ----------
-    fluid : (h, w), where the chip holds fluid.
-    """
+    """A flow field with a row for each pixel of fluid. `fluid`: (h, w), where the chip holds fluid."""
     columns = zip(VALUES, values_of(field, fluid).T, strict=True)
     return _table(VALUES, [None if field.std_um_s is None and "std" in name else values for name, values in columns])
 

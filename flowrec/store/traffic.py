@@ -93,6 +93,8 @@ def ask_repeatedly(
 ) -> _Answered:
     """An answer, after several tries and within the time limit.
 
+    Raises SessionError: there is none, in one line; MissingError if that is because of this object.
+
     Parameters
     ----------
     path : what is asked for, for messages.
@@ -100,10 +102,6 @@ def ask_repeatedly(
     wanted : whether it is still worth a try.
     limit_s : time limit of all tries together in s; None: that of a request.
     done : what could not be done with it, for messages.
-
-    Raises
-    ------
-    SessionError : there is none, in one line; MissingError if that is because of this object.
     """
     end_s = time.monotonic() + (limit_s or timeout_s())
     reason = ""

@@ -25,6 +25,8 @@ def draw(
 ) -> None:
     """Add the viewer topics to a file that holds all of its messages, and none of these topics.
 
+    Raises SessionError: the file can not be read back. OSError : the disk refuses.
+
     Parameters
     ----------
     path, out : the file, and what writes it.
@@ -32,10 +34,6 @@ def draw(
     start_unix_ns : Unix time of stamp 0.
     left_out : viewer topics that are not wanted.
     outcome : of the run.
-
-    Raises
-    ------
-    SessionError : the file can not be read back. OSError : the disk refuses.
     """
     if left_out >= VIEWED:
         return

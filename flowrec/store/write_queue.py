@@ -229,10 +229,7 @@ class FrameDecimation:
 
     One in `every` images is kept, counted from the first, so that the kept ones are evenly spaced also across a change.
     When the queue has run low, `every` is halved; if it must soon be doubled again, the next try waits twice as long.
-
-    Attributes
-    ----------
-    every : 1, 2, 4, 8 or 16.
+    `every`: 1, 2, 4, 8 or 16.
     """
 
     def __init__(self) -> None:

@@ -46,9 +46,10 @@ _messages_of: Callable[[Tick], tuple[Any, ...]] = operator.attrgetter(*_FIELDS)
 class SessionWriter:
     """Records ticks in a new session file; `write` returns at once, a recorder compresses and writes.
 
-    Until `close` the file is named `PATH.partial`; then it gets its name in one step. A message is written in
-    the first tick that holds it, with the tick's stamp as log time; the arrays of a message must not change
-    afterwards. To be used as a context manager: an exception that leaves the block becomes the outcome.
+    Until `close` the file is named `PATH.partial`; then it gets its name in one step. A message is written in the first
+    tick that holds it, with the tick's stamp as log time; the arrays of a message must not change afterwards. To be
+    used as a context manager: an exception that leaves the block becomes the outcome. Raises SessionError: the path can
+    not be written, or is taken.
 
     Parameters
     ----------
@@ -63,10 +64,6 @@ class SessionWriter:
     dropped_frames : images that were left out because the disk is too slow.
     missing_frames : of a live run: images that the camera counted and never delivered.
     remarks : texts about snapshots, added while the run goes on.
-
-    Raises
-    ------
-    SessionError : the path can not be written, or is taken.
     """
 
     def __init__(
@@ -137,10 +134,8 @@ class SessionWriter:
     def write(self, tick: Tick) -> None:
         """Record what is new in this tick.
 
-        Raises
-        ------
-        SessionError : the disk has failed, a message does not fit its declaration (both are raised by a later call
-            than the one that caused them), the session is closed, or the stamp does not increase.
+        Raises SessionError: the disk has failed, a message does not fit its declaration (both are raised by a later
+        call than the one that caused them), the session is closed, or the stamp does not increase.
         """
         if self._recorder.failure is not None and self._goes_on():
             return
@@ -199,16 +194,14 @@ class SessionWriter:
     def close(self, outcome: Mapping[str, str] | None = None, timeout_s: float | None = None, *, why: str = "") -> None:
         """Finish the file and give it its name; a second call does nothing.
 
+        Raises SessionError: the file could not be finished; what could be written stays in `PATH.partial`.
+
         Parameters
         ----------
         outcome : how the run ended, as text; numbers of ticks and of dropped frames are added.
         timeout_s : time for writing the images in the queue, in s; the images that remain are dropped and counted. All
             other messages are always written. None: no limit.
         why : take a snapshot of the end, for this reason.
-
-        Raises
-        ------
-        SessionError : the file could not be finished; what could be written stays in `PATH.partial`.
         """
         if self._closed:
             return

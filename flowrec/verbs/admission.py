@@ -55,20 +55,12 @@ _POLL_S = 0.005
 
 
 class Held(NamedTuple):
-    """Rates that a trial has measured, in images a second.
+    """Rates that a trial has measured, in images a second."""
 
-    Attributes
-    ----------
-    asked_hz : rate of the camera.
-    ticks_hz : of the pipeline's ticks.
-    written_hz : of what reached the disk.
-    realtime : whether the loop had real-time priority.
-    """
-
-    asked_hz: float
-    ticks_hz: float
-    written_hz: float
-    realtime: bool = True
+    asked_hz: float  # rate of the camera
+    ticks_hz: float  # of the pipeline's ticks
+    written_hz: float  # of what reached the disk
+    realtime: bool = True  # whether the loop had real-time priority
 
     @property
     def hz(self) -> float:
@@ -95,18 +87,15 @@ def admit(
 ) -> dict[str, str]:
     """Let the worker do the first order, then measure; return the result for the head of the session.
 
-    Nothing is done for a rig whose images can not be had before the run, and after a stop.
+    Nothing is done for a rig whose images can not be had before the run, and after a stop. Raises FlowrecError: images
+    would be lost, and `recording.accept_losses` is not set; the first order can not be done, the camera gives no image,
+    the folder can not be written.
 
     Parameters
     ----------
     rig : connected, not entered.
     known : flow fields of an earlier session, which the run begins with.
     folder : of the session; a file in it is written, and removed.
-
-    Raises
-    ------
-    FlowrecError : images would be lost, and `recording.accept_losses` is not set; the first order can not be done, the
-        camera gives no image, the folder can not be written.
     """
     config, chip, pipeline = of
     if not isinstance(rig, Tried) or control.reason:
@@ -237,14 +226,12 @@ _ON_THE_ROBOT_PX = (15, 38)  # column, row of these images, at the start
 def rehearse(config: Config, stopped: Callable[[], object] = lambda: False, progress: Progress | None = None) -> None:
     """Fly a short mission with the methods of a configuration, as fast as it goes and without a file.
 
+    Raises FlowrecError: a method of the configuration can not be used here.
+
     Parameters
     ----------
     stopped : asked after every tick; the rehearsal ends when it says so.
     progress : takes the seconds of session so far, of `LENGTH_S`.
-
-    Raises
-    ------
-    FlowrecError : a method of the configuration can not be used here.
     """
     progress = progress if progress is not None else Progress()
     small = _small(config)

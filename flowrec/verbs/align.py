@@ -118,10 +118,8 @@ def _refuse_doubtful(fit: MotionFit, prepared: Prepared) -> None:
 def align_log(looked: Looked) -> Looked:
     """Look at the log: its clock as the motion shows it, the fit for the head of the session, doubts.
 
-    Raises
-    ------
-    UsageError : the log does not explain the motion, in one line with what to do.
-    ChipError : it does in another orientation, and the image does not tell that it is the log's.
+    Raises UsageError: the log does not explain the motion, in one line with what to do; ChipError: it does in another
+    orientation, and the image does not tell that it is the log's.
     """
     asked, rough, tracks = looked.asked, looked.prepared.config, looked.tracks
     assert tracks is not None, "there is a log"

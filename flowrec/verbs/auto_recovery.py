@@ -38,13 +38,8 @@ def leftovers(folder: Path) -> list[Path]:
 def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> dict[Path, str]:
     """Recover small unfinished sessions and print the command for larger ones, a line for each; never raises for one.
 
-    Parameters
-    ----------
-    excluded : remains to leave locked, because they will be overwritten.
-
-    Returns
-    -------
-    The recovered sessions, each with a summary.
+    `excluded`: remains to leave locked, because they will be overwritten. Returns the recovered sessions, each with a
+    summary.
     """
     unfinished = [path for path in leftovers(folder) if path.resolve() not in excluded]
     if not unfinished:

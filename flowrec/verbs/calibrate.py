@@ -59,12 +59,10 @@ def coils(
 @verb()
 def motion(
     session: Annotated[
-        Path,
-        typer.Argument(metavar="SESSION", callback=known_session, help="Session (.mcap), recorded or imported."),
+        Path, typer.Argument(metavar="SESSION", callback=known_session, help="Session (.mcap), recorded or imported.")
     ],
     coils: Annotated[
-        Path | None,
-        typer.Option("--coils", metavar="LOG", help="Another log of the coils (CSV, Excel), on any clock."),
+        Path | None, typer.Option("--coils", metavar="LOG", help="Another log of the coils (CSV, Excel), on any clock.")
     ] = None,
     out: TomlOut = None,
     overwrite: Overwrite = False,
@@ -118,8 +116,7 @@ def chip(
         float | None, typer.Option("--inlet-speed", metavar="UM_S", help="Mean speed at the inlets, in um/s.")
     ] = None,
     walls: Annotated[
-        str,
-        typer.Option(metavar="auto|dark|bright|step|relief", help="How walls show: as lines, or as a step."),
+        str, typer.Option(metavar="auto|dark|bright|step|relief", help="How walls show: as lines, or as a step.")
     ] = "auto",
     seed_point: Annotated[
         list[str] | None,

@@ -32,8 +32,7 @@ def check(
     progress: Callable[[int], None] | None = None,
     bar: Annotated[Bar | None, BAR] = None,
     signers: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Trusted keys, and whose: as ALLOWED SIGNERS of ssh-keygen."),
+        Path | None, typer.Option(metavar="FILE", help="Trusted keys, and whose: as ALLOWED SIGNERS of ssh-keygen.")
     ] = None,
 ) -> "Verdict":
     """Validate a session; exit status 0: good, 3: usable with losses or anomalies, 1: not usable.

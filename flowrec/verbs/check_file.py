@@ -26,12 +26,7 @@ from flowrec.core import (
 )
 from flowrec.physics import chip_from_files
 from flowrec.stages import ResolvedConfig, TrackQuality, calibration_of, config_from_toml, needed_packages
-from flowrec.store import (
-    FRAME_PATH,
-    Audit,
-    audit,
-    is_left_out,
-)
+from flowrec.store import FRAME_PATH, Audit, audit, is_left_out
 from flowrec.verbs.verdict import (
     CONSISTENT,
     DAMAGED,
@@ -54,9 +49,7 @@ NOT_EXACT = "yes, but not exact after the first missing message"
 class FileCheck:
     """Reads one file and fills its verdict, one method for each subject.
 
-    Attributes
-    ----------
-    read_bytes : how far it is.
+    `read_bytes`: how far it is.
     """
 
     def __init__(self, path: Path, progress: Callable[[], None]) -> None:

@@ -36,13 +36,7 @@ from flowrec.verbs.ls import ls
 from flowrec.verbs.methods import methods
 from flowrec.verbs.new import new
 from flowrec.verbs.note import note
-from flowrec.verbs.options import (
-    HELP_SETTINGS,
-    OUR_VERBS,
-    Stoppable,
-    WholeDescriptions,
-    from_above,
-)
+from flowrec.verbs.options import HELP_SETTINGS, OUR_VERBS, Stoppable, WholeDescriptions, from_above
 from flowrec.verbs.record import record
 from flowrec.verbs.recover import recover
 from flowrec.verbs.replay import DEFAULT_REFINE, replay

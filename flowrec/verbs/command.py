@@ -82,21 +82,13 @@ class Told(NamedTuple):
 
 
 class Verb(NamedTuple):
-    """Properties of the command of a verb besides its options.
+    """Properties of the command of a verb besides its options."""
 
-    Attributes
-    ----------
-    parameters : of the function, with options and marks.
-    examples : what a person may type, at the end of the help.
-    with_json : it has --json.
-    result : makes what is told of the arguments and what the function returned.
-    refused : makes the JSON of an error, of the arguments and the error; None: an error is a line on stderr.
-    """
-
-    parameters: tuple[inspect.Parameter, ...]
-    examples: tuple[str, ...]
-    with_json: bool
-    result: Callable[[Asked, Any], Told]
+    parameters: tuple[inspect.Parameter, ...]  # of the function, with options and marks
+    examples: tuple[str, ...]  # what a person may type, at the end of the help
+    with_json: bool  # it has --json
+    result: Callable[[Asked, Any], Told]  # makes what is told of the arguments and what the function returned
+    # makes the JSON of an error, of the arguments and the error; None: an error is a line on stderr
     refused: Callable[[Asked, FlowrecError], dict[str, Any]] | None
 
 
@@ -287,9 +279,7 @@ def _documentation(function: Callable[..., Any]) -> str:
 def outside_verb(name: str) -> Any:
     """The verb of a name that a package of others brings, as a command for typer; None if none does.
 
-    Raises
-    ------
-    UsageError : its package can not be imported, or declares no function.
+    Raises UsageError: its package can not be imported, or declares no function.
     """
     from flowrec.core import VERBS, the_one
 

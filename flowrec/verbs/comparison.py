@@ -44,24 +44,14 @@ _ALL = _fields_of(TOPICS)
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One of the two sides of a comparison.
+    """One of the two sides of a comparison."""
 
-    Attributes
-    ----------
-    word : what its values are called.
-    name : what it is called as a whole.
-    recorded : the fields that it records.
-    copy : it is a replay, into which images are copied on request only.
-    numerics : version of the numerics that computed it.
-    topics : those that it can record.
-    """
-
-    word: str
-    name: str
-    recorded: Fields = field(default_factory=lambda: _ALL)
-    copy: bool = False
-    numerics: str = field(default_factory=lambda: str(NUMERICS_VERSION))
-    topics: TopicTable = FIXED
+    word: str  # what its values are called
+    name: str  # what it is called as a whole
+    recorded: Fields = field(default_factory=lambda: _ALL)  # the fields that it records
+    copy: bool = False  # it is a replay, into which images are copied on request only
+    numerics: str = field(default_factory=lambda: str(NUMERICS_VERSION))  # version of the numerics that computed it
+    topics: TopicTable = FIXED  # those that it can record
 
     @classmethod
     def of_replay(cls, topics: TopicTable) -> Side:
@@ -91,25 +81,17 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Largest difference of two messages of a topic: one element of one field.
-
-    Attributes
-    ----------
-    stamp_ns : of the tick.
-    index : of the element in an array; None for other values.
-    values : of the element, or text about a whole message or array; in the order of `words`.
-    excess : the difference divided by the tolerance of the field; inf if the tolerance is zero or the values have no
-        difference.
-    words : what the two sides are called.
-    """
+    """Largest difference of two messages of a topic: one element of one field."""
 
     topic: str
-    stamp_ns: int
+    stamp_ns: int  # of the tick
     field: str
-    index: tuple[int, ...] | None
-    values: tuple[object, object]
+    index: tuple[int, ...] | None  # of the element in an array; None for other values
+    values: tuple[object, object]  # of the element, or text about a whole message or array; in the order of `words`
+    # the difference divided by the tolerance of the field; inf if the tolerance is zero or the values have no
+    # difference
     excess: float
-    words: tuple[str, str]
+    words: tuple[str, str]  # what the two sides are called
 
     @property
     def beyond(self) -> bool:
@@ -163,27 +145,18 @@ class TopicCount:
 
 @dataclass(slots=True)
 class Comparison:
-    """Compares pairs of ticks: messages that are new in either tick and recorded on both sides.
+    """Compares pairs of ticks: messages that are new in either tick and recorded on both sides."""
 
-    Attributes
-    ----------
-    roles : of the topics that `add` compares.
-    sides : what is compared.
-    left_out : paths of topics that `add` passes over.
-    lone : ticks that only one side has.
-    not_recorded : topics, and fields of a topic as `/topic field`, that one side lacks, with the words for it.
-    first : the first difference beyond a tolerance.
-    """
-
-    roles: tuple[Role, ...] = (Role.OUTPUT,)
-    sides: tuple[Side, Side] = (Side("recorded", "the recording"), Side("replayed", "the replay"))
-    left_out: frozenset[str] = frozenset()
+    roles: tuple[Role, ...] = (Role.OUTPUT,)  # of the topics that `add` compares
+    sides: tuple[Side, Side] = (Side("recorded", "the recording"), Side("replayed", "the replay"))  # what is compared
+    left_out: frozenset[str] = frozenset()  # paths of topics that `add` passes over
     ticks: int = 0
     different_ticks: int = 0
-    lone: int = 0
+    lone: int = 0  # ticks that only one side has
     topics: dict[str, TopicCount] = field(default_factory=dict)
+    # topics, and fields of a topic as `/topic field`, that one side lacks, with the words for it
     not_recorded: dict[str, str] = field(default_factory=dict)
-    first: Difference | None = None
+    first: Difference | None = None  # the first difference beyond a tolerance
     _before: tuple[Tick, Tick] = (Tick(), Tick())
     _names: dict[str, list[str]] = field(default_factory=dict)
     _known: TopicTable = FIXED

@@ -70,18 +70,11 @@ _CAUSES = {
 
 
 class Finding(NamedTuple):
-    """One line.
+    """One line."""
 
-    Attributes
-    ----------
-    what : what was looked at.
-    level : ok, warning or failure.
-    text : what was found, with what to do unless it is ok.
-    """
-
-    what: str
-    level: str
-    text: str
+    what: str  # what was looked at
+    level: str  # ok, warning or failure
+    text: str  # what was found, with what to do unless it is ok
 
     @property
     def line(self) -> str:
@@ -375,9 +368,7 @@ def _viewer() -> _Row:
 def of_devices(file: Path | None, sets: Mapping[str, Any], wrong: UsageError) -> Config:
     """The settings of camera and coils that are right in themselves, where the whole configuration is refused.
 
-    Raises
-    ------
-    UsageError : `wrong`, where the configuration is none of a lab; the file can not be read.
+    Raises UsageError: `wrong`, where the configuration is none of a lab; the file can not be read.
     """
     tree: dict[str, Any] = read_toml(file) if file is not None else {}
     apply_sets(tree, sets)
@@ -399,9 +390,7 @@ def of_devices(file: Path | None, sets: Mapping[str, Any], wrong: UsageError) ->
 def stand_in(asked: Config) -> ResolvedConfig:
     """The settings of camera, coils and lab that are given, with those of a made-up run for all the rest.
 
-    Raises
-    ------
-    UsageError : these are wrong, too.
+    Raises UsageError: these are wrong, too.
     """
     devices = {section: getattr(asked, section) for section in _OF_DEVICES}
     made_up = resolve(replace(Config(), rig=SIMULATED, recording=asked.recording, **devices), load_chip(ChipSettings()))

@@ -20,9 +20,7 @@ _SLICE_S = 0.5  # of the wait for Ctrl-C
 class Flown:
     """A mission that was flown on emulated devices, or none.
 
-    Attributes
-    ----------
-    exit_status : of the recorder.
+    `exit_status`: of the recorder.
     """
 
     def __init__(self, session: Path | None = None, exit_status: int = 0, latency: str = "") -> None:
@@ -47,8 +45,7 @@ def lab(
         Path | None, typer.Option(metavar="SESSION", help="Record one mission on them, and end them after it.")
     ] = None,
     camera_delay_ms: Annotated[
-        float,
-        typer.Option(metavar="MS", min=0.0, max=500.0, help="Time from the end of an exposure to its image."),
+        float, typer.Option(metavar="MS", min=0.0, max=500.0, help="Time from the end of an exposure to its image.")
     ] = 12.0,
     sets: Sets = None,
     world: Annotated[

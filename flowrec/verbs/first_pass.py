@@ -61,26 +61,15 @@ _AMBER, _BLACK = (38, 140, 255), (0, 0, 0)  # blue, green, red
 
 
 class MovieTracks(NamedTuple):
-    """Track of the robot in the images of a movie, before anything is recorded.
+    """Track of the robot in the images of a movie, before anything is recorded."""
 
-    Attributes
-    ----------
-    stamps_ns : (n,) session stamps of the images in which it is seen, by movie.clock_rate and clock_offset_s.
-    positions_um : (n, 2) on the chip.
-    log : what the coils did on the same clock, without the robot's delay.
-    shake_px : root mean square of the images' motion against the walls; None: it can not be measured.
-    stabilised : that motion is taken out of the positions.
-    um_per_px : of the camera.
-    doubts : about the track.
-    """
-
-    stamps_ns: Ints
-    positions_um: Floats
-    log: FieldLog
-    shake_px: float | None
-    stabilised: bool
-    um_per_px: float
-    doubts: Sequence[str]
+    stamps_ns: Ints  # (n,) session stamps of the images in which it is seen, by movie.clock_rate and clock_offset_s
+    positions_um: Floats  # (n, 2) on the chip
+    log: FieldLog  # what the coils did on the same clock, without the robot's delay
+    shake_px: float | None  # root mean square of the images' motion against the walls; None: it can not be measured
+    stabilised: bool  # that motion is taken out of the positions
+    um_per_px: float  # of the camera
+    doubts: Sequence[str]  # about the track
 
     @property
     def time_s(self) -> Floats:
@@ -89,26 +78,19 @@ class MovieTracks(NamedTuple):
 
 
 class Looked(NamedTuple):
-    """Findings of a movie before it is imported.
+    """Findings of a movie before it is imported."""
 
-    Attributes
-    ----------
-    asked : the configuration with what the movie shows.
-    facts : for the head of the session.
-    prepared : the settings of the pass, its chip, and what its images say about the axes.
-    tracks : None where there is no log that they could be compared with.
-    doubts : reasons to doubt the import.
-    """
-
-    asked: Config
-    facts: Mapping[str, str]
-    prepared: Prepared
-    tracks: MovieTracks | None
-    doubts: Sequence[str] = ()
+    asked: Config  # the configuration with what the movie shows
+    facts: Mapping[str, str]  # for the head of the session
+    prepared: Prepared  # the settings of the pass, its chip, and what its images say about the axes
+    tracks: MovieTracks | None  # None where there is no log that they could be compared with
+    doubts: Sequence[str] = ()  # reasons to doubt the import
 
 
 def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: Path) -> Looked:
     """Look through the movie once; the robot is tracked if there is a log to compare with.
+
+    Raises UsageError: several bodies qualify, or the given one is not there; FlowrecError: as `import_movie`.
 
     Parameters
     ----------
@@ -117,11 +99,6 @@ def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: 
         of the first image, or "X,Y" in um on the chip; none: the only one that qualifies, or the one of
         tracker.click_px or box_px, or the tracker.robots most similar discs.
     folder : for the picture of the candidates.
-
-    Raises
-    ------
-    UsageError : several bodies qualify, or the given one is not there.
-    FlowrecError : as `import_movie`.
     """
     named = [robot for robot in robots if robot]
     robot = named[0] if named else ""

@@ -28,8 +28,7 @@ def _import_told(_asked: Asked, done: "Recorded") -> Told:
 @verb("flowrec import movie.avi lab.toml --coils coils.csv -o a.mcap", result=_import_told)
 def import_movie(
     movie: Annotated[
-        Path | str,
-        typer.Argument(help="Movie: AVI, MP4, MKV, MOV, TIFF, ND2, OME-Zarr, or a folder of images."),
+        Path | str, typer.Argument(help="Movie: AVI, MP4, MKV, MOV, TIFF, ND2, OME-Zarr, or a folder of images.")
     ],
     out: SessionOut = None,
     config: Annotated[
@@ -46,8 +45,7 @@ def import_movie(
     fps: Annotated[float | None, typer.Option(metavar="F", help="Images per second, where no times are known.")] = None,
     partial: Annotated[bool, typer.Option("--partial", help="Take a movie that breaks off up to there.")] = False,
     align: Annotated[
-        bool,
-        typer.Option("--align/--no-align", help="Fit the clock of the log to the motion of the robot."),
+        bool, typer.Option("--align/--no-align", help="Fit the clock of the log to the motion of the robot.")
     ] = True,
     robot: Annotated[
         list[str] | Sequence[str | int] | str | int,

@@ -33,25 +33,15 @@ _ASKED_OF_COILS = {"serial": ("lab.serial.port",), "ni": ("lab.ni.channels",)}  
 
 
 class StartedConfig(NamedTuple):
-    """A configuration that was written, and its files.
+    """A configuration that was written, and its files."""
 
-    Attributes
-    ----------
-    source : the movie, or `lab`.
-    chip : its file; None: it is one that was there already.
-    coils : log of a movie.
-    timed : the movie states the times of its images.
-    picture : the movie, or the image of the camera.
-    still : it is one image alone.
-    """
-
-    source: Path
+    source: Path  # the movie, or `lab`
     path: Path
-    chip: Path | None
-    coils: Path | None
-    timed: bool
-    picture: Path
-    still: bool
+    chip: Path | None  # its file; None: it is one that was there already
+    coils: Path | None  # log of a movie
+    timed: bool  # the movie states the times of its images
+    picture: Path  # the movie, or the image of the camera
+    still: bool  # it is one image alone
 
     def as_json(self) -> dict[str, Any]:
         """For JSON."""

@@ -34,9 +34,7 @@ _NOTE_SHOWN = 60  # characters of a long note, from its end
 class Unattended:
     """A run that is a function call, in any thread: it takes no signals and no keys and prints no progress.
 
-    Attributes
-    ----------
-    run_control : controls the run from another thread, for example `run_control.stop("enough")`.
+    `run_control`: controls the run from another thread, for example `run_control.stop("enough")`.
     """
 
     def __init__(self, run_control: RunControl | None = None) -> None:
@@ -119,12 +117,7 @@ class StatusLine:
     note : the note that a person is typing; None without one.
     """
 
-    def __init__(
-        self,
-        file_bytes: Callable[[], int],
-        disk: Callable[[], str],
-        note: Callable[[], str | None],
-    ) -> None:
+    def __init__(self, file_bytes: Callable[[], int], disk: Callable[[], str], note: Callable[[], str | None]) -> None:
         self._file_bytes = file_bytes
         self._disk = disk
         self._note = note

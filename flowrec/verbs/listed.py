@@ -30,25 +30,17 @@ _NAME_LIMIT = 60  # characters of a name; a longer one in a file is damage
 
 @dataclass(frozen=True, slots=True)
 class ListedSession:
-    """One session, or one run with all its parts; unknown values are None or empty.
+    """One session, or one run with all its parts; unknown values are None or empty."""
 
-    Attributes
-    ----------
-    name : of the file; with its folder where several folders are listed.
-    outcome : how the run ended, or: recording, unfinished, unreadable.
-    note : why.
-    parts : of a run that was split; finished or not.
-    facts : of `flowrec info`, with the notes and tags that were added later.
-    """
-
-    name: str
-    outcome: str
-    note: str
+    name: str  # of the file; with its folder where several folders are listed
+    outcome: str  # how the run ended, or: recording, unfinished, unreadable
+    note: str  # why
     size_bytes: int
     duration_s: float | None = None
     chip: str = ""
     recorded: str = ""
-    parts: int = 0
+    parts: int = 0  # of a run that was split; finished or not
+    # of `flowrec info`, with the notes and tags that were added later
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
@@ -69,9 +61,7 @@ def kind_of(name: str) -> type:
 def columns_of(listed: ListedSession, path: str) -> dict[str, Any]:
     """Values by column, each of the kind of its column, None if unknown; LISTS are lists of texts.
 
-    Parameters
-    ----------
-    path : of the session, as the column of that name states it.
+    `path`: of the session, as the column of that name states it.
     """
     stated = ((key.lower(), value) for key, value in listed.as_json().items() if _is_name(key))
     facts = dict(itertools.islice(stated, _FACTS_LIMIT))

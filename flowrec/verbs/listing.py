@@ -13,25 +13,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flowrec.core import SessionError, UsageError, is_growing
-from flowrec.store import (
-    PARTIAL_SUFFIX,
-    SESSION_SUFFIX,
-    Session,
-    UrlPath,
-    part_number,
-    run_files,
-    run_path,
-)
+from flowrec.store import PARTIAL_SUFFIX, SESSION_SUFFIX, Session, UrlPath, part_number, run_files, run_path
 from flowrec.verbs.info import info
-from flowrec.verbs.listed import (
-    ALWAYS,
-    LISTS,
-    ListedSession,
-    columns_of,
-    kind_of,
-    text_of_list,
-    unknown_name,
-)
+from flowrec.verbs.listed import ALWAYS, LISTS, ListedSession, columns_of, kind_of, text_of_list, unknown_name
 
 _TOGETHER = 16  # sessions at URLs that are read at a time
 NAMES = (SESSION_SUFFIX, SESSION_SUFFIX + PARTIAL_SUFFIX)  # ends of the names of sessions, finished or not
@@ -57,11 +41,8 @@ def list_sessions(places: Iterable[Path], where: str, sort: str) -> list[ListedS
 def read_each(read: Callable[[T], R], sessions: Iterable[T], far: bool) -> Iterator[Iterator[R]]:
     """Context with what `read` returns of each session, in their order.
 
-    What has not begun when the context is left is not read: a person who interrupts does not wait for it.
-
-    Parameters
-    ----------
-    far : some are at URLs, where each waits for its server: many are read at a time.
+    What has not begun when the context is left is not read: a person who interrupts does not wait for it. `far`: some
+    are at URLs, where each waits for its server: many are read at a time.
     """
     if not far:
         yield map(read, sessions)

@@ -48,14 +48,7 @@ from flowrec.run import (
     obey,
     run,
 )
-from flowrec.stages import (
-    MOVIE,
-    RIGS,
-    Config,
-    RunStatistics,
-    extra_rows,
-    shortest_way,
-)
+from flowrec.stages import MOVIE, RIGS, Config, RunStatistics, extra_rows, shortest_way
 from flowrec.store import SessionWriter, session_writer
 from flowrec.verbs.admission import admit, rehearse_aloud
 from flowrec.verbs.interactive import Unattended
@@ -94,7 +87,8 @@ def run_mission(
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
-    The field is off before this function returns or raises, whatever the exception; also for KeyboardInterrupt.
+    The field is off before this function returns or raises, whatever the exception; also for KeyboardInterrupt. Raises
+    FlowrecError: any of its kinds; a stage, a rig or a worker may raise others.
 
     Parameters
     ----------
@@ -107,10 +101,6 @@ def run_mission(
     looked : of an import, what the movie has shown before. It can be done again: one that ends by an exception leaves
         no file, and one that it was to replace stays.
     log : values of this program, which are recorded beside the run.
-
-    Raises
-    ------
-    FlowrecError : any of its kinds; a stage, a rig or a worker may raise others.
     """
     if console:
         refuse_without_packages()

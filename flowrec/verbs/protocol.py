@@ -49,18 +49,11 @@ class RowResult(NamedTuple):
 
 
 class DayProtocol(NamedTuple):
-    """The protocol as far as it has come.
+    """The protocol as far as it has come."""
 
-    Attributes
-    ----------
-    results : of each row, in order.
-    session : of the mission, which has them as a note; None: there is none yet.
-    folder : of all its files.
-    """
-
-    results: tuple[RowResult, ...]
-    session: Path | None
-    folder: Path
+    results: tuple[RowResult, ...]  # of each row, in order
+    session: Path | None  # of the mission, which has them as a note; None: there is none yet
+    folder: Path  # of all its files
 
     @property
     def exit_status(self) -> int:
@@ -110,13 +103,8 @@ def walk(
 ) -> DayProtocol:
     """Measure what has not passed yet, in order.
 
-    Parameters
-    ----------
-    only : names of the rows that are measured, again if they have passed; (): all that have not.
-
-    Raises
-    ------
-    UsageError : there is no such row. FlowrecError : the configuration describes no lab.
+    `only`: names of the rows that are measured, again if they have passed; (): all that have not. Raises UsageError:
+    there is no such row. FlowrecError : the configuration describes no lab.
     """
     unknown = set(only) - {row.name for row in ROWS}
     if unknown:

@@ -18,14 +18,12 @@ from flowrec.verbs.protocol_hands import ProtocolHand, free_path
 class Day:
     """Configuration, files and hands with which the rows measure.
 
+    `config`: resolved on its chip.
+
     Parameters
     ----------
     asked : the configuration; `file` and `sets` are what it was made of.
     folder : for the sessions.
-
-    Attributes
-    ----------
-    config : resolved on its chip.
     """
 
     def __init__(
@@ -51,12 +49,7 @@ class Day:
         )
 
     def run(self, name: str, *sets: str) -> Session:
-        """The session of a run, which is recorded once.
-
-        Raises
-        ------
-        FlowrecError : it was refused; what the recorder said.
-        """
+        """The session of a run, which is recorded once. Raises FlowrecError: it was refused; what the recorder said."""
         if name not in self.sessions:
             path = self.new_path(name)
             process = self.start(path, *sets)

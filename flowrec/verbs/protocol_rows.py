@@ -33,19 +33,12 @@ class NotDoneError(FlowrecError):
 
 
 class RowValue(NamedTuple):
-    """A value, in the unit of its row.
-
-    Attributes
-    ----------
-    limit : the largest value that is good.
-    text : what was measured, for people.
-    session : from which it was read.
-    """
+    """A value, in the unit of its row."""
 
     value: float
-    limit: float
-    text: str
-    session: Path | None = None
+    limit: float  # the largest value that is good
+    text: str  # what was measured, for people
+    session: Path | None = None  # from which it was read
 
 
 class ProtocolRow(NamedTuple):

@@ -81,8 +81,7 @@ def record(
     *,
     rig: Annotated[str | None, typer.Option(help="Rig to use: simulated, movie, lab.")] = None,
     goal: Annotated[
-        str | tuple[float, float] | None,
-        typer.Option(metavar="X,Y", help="Goal in um, or inlet, outlet, outlet:1."),
+        str | tuple[float, float] | None, typer.Option(metavar="X,Y", help="Goal in um, or inlet, outlet, outlet:1.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig.")] = None,
     sets: Sets = None,

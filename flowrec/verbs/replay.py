@@ -29,11 +29,7 @@ def _output_of(asked: Asked, done: "Replay") -> Told:
     )
 
 
-@verb(
-    "flowrec replay a.mcap --refine",
-    "flowrec replay a.mcap --plan astar_time --refly -o b.mcap",
-    result=_output_of,
-)
+@verb("flowrec replay a.mcap --refine", "flowrec replay a.mcap --plan astar_time --refly -o b.mcap", result=_output_of)
 def replay(
     session: SessionFile,
     change: "Change | None" = None,

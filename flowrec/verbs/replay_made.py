@@ -9,19 +9,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.core import (
-    FLOW_FIELDS,
-    MCAP,
-    RRD,
-    Output,
-    Phase,
-    Row,
-    SessionError,
-    UsageError,
-    progress,
-    say,
-    seconds,
-)
+from flowrec.core import FLOW_FIELDS, MCAP, RRD, Output, Phase, Row, SessionError, UsageError, progress, say, seconds
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, RunControl, RunReport, Sink, run
 from flowrec.stages import assemble, facts_of, other_packages
@@ -91,15 +79,8 @@ def refly(done: Replay, out: Output | None) -> list[Row]:
     """Fly the recorded and the replayed plan in a simulator, in the true flow of the session or else the replay's map.
 
     Both flights begin where the recorded route does and have the same seed; rows as of `before_after`. They go straight
-    to the last goal and keep the last speed limit that the operator has set.
-
-    Parameters
-    ----------
-    out : session file of the flight of the replayed plan.
-
-    Raises
-    ------
-    UsageError : there is no map or no route to fly.
+    to the last goal and keep the last speed limit that the operator has set. `out`: session file of the flight of the
+    replayed plan. Raises UsageError: there is no map or no route to fly.
     """
     if done.replayed.field is None or done.recorded.mission is None or done.recorded.route is None:
         raise UsageError(

@@ -23,6 +23,7 @@ from flowrec.core import (
     UsageError,
     WorkOrder,
     comparison_for_people,
+    needs,
     printable,
     say,
     table,
@@ -153,10 +154,8 @@ class BeforeAfter(tuple[Row, ...]):
 
     def to_pandas(self) -> pandas.DataFrame:
         """The columns recorded and replayed, a row a key; UsageError if pandas is not installed."""
-        try:
+        with needs("to_pandas", "export"):
             import pandas
-        except ModuleNotFoundError as error:
-            raise UsageError("to_pandas needs pandas, which is not installed: pip install 'flowrec[export]'") from error
         columns = {"recorded": [row[1] for row in self], "replayed": [row[2] for row in self]}
         return pandas.DataFrame(columns, index=pandas.Index([row[0] for row in self], name="quantity"), dtype=object)
 

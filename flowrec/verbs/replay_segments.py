@@ -47,16 +47,14 @@ def verify(
 ) -> Replay:
     """Replay a session as it was recorded, in `jobs` processes, and compare every message.
 
+    Raises UsageError: a number of jobs that is not possible, or a time outside of the session; SessionError: the
+    session can not be read or replayed, or a process was killed.
+
     Parameters
     ----------
     jobs : processes at a time; 1: one pass in this process, as for a session of other numerics; 0: one for each core.
     from_s : session time in s to start at.
     control : as of `replay`. Of a verification that it stops, the segments count that were done by then.
-
-    Raises
-    ------
-    UsageError : a number of jobs that is not possible, or a time outside of the session.
-    SessionError : the session can not be read or replayed, or a process was killed.
     """
     if not 0 <= jobs <= _JOBS_LIMIT:
         raise UsageError(f"--jobs {jobs}: the number of processes is 1 to {_JOBS_LIMIT}, or 0 for one a core")

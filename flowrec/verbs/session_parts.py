@@ -90,18 +90,12 @@ class Choice:
 
 
 class SessionParts(NamedTuple):
-    """A session without the messages of its ticks.
+    """A session without the messages of its ticks."""
 
-    Attributes
-    ----------
-    head : settings, chip, origin, outcome, and the records of other programs, by name.
-    declared : declarations of the channels, by topic: the metadata, and a hash of the schema.
-    digest : of the first file, by topic; None without one.
-    """
-
-    head: dict[str, Item]
+    head: dict[str, Item]  # settings, chip, origin, outcome, and the records of other programs, by name
+    # declarations of the channels, by topic: the metadata, and a hash of the schema
     declared: dict[str, dict[str, str]]
-    digest: dict[str, str] | None
+    digest: dict[str, str] | None  # of the first file, by topic; None without one
 
     @classmethod
     def of(cls, session: Session) -> SessionParts:
@@ -155,17 +149,11 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]
 
 
 class PartOfHead(NamedTuple):
-    """Comparison of one part of two heads.
-
-    Attributes
-    ----------
-    items : that were compared.
-    differences : by item, what differs as text.
-    """
+    """Comparison of one part of two heads."""
 
     name: str
-    items: int
-    differences: Mapping[str, str]
+    items: int  # that were compared
+    differences: Mapping[str, str]  # by item, what differs as text
 
     def line(self, width: int) -> str:
         """A line of text."""

@@ -78,6 +78,9 @@ def replay_session(
 ) -> Replay:
     """Replay a session, in any thread; write the result to a new session if `out` is given.
 
+    Raises UsageError: a change that is not possible, or a time outside of the session; SessionError: the session can
+    not be read or replayed, or `out` not be written.
+
     Parameters
     ----------
     change : other methods and settings; None: as recorded.
@@ -90,11 +93,6 @@ def replay_session(
         returns what was done by then, and `covered` of the result says so.
     segment_ns : replay a segment of a verification: stamps of its first and its last tick, None for the beginning. Its
         start is compared in the segment before, and digests are not.
-
-    Raises
-    ------
-    UsageError : a change that is not possible, or a time outside of the session.
-    SessionError : the session can not be read or replayed, or `out` not be written.
     """
     if out is not None:
         source = session.path if isinstance(session, Session) else session_path(session)
@@ -294,9 +292,7 @@ def _with_recorded_region(session: Session, config: ResolvedConfig) -> ResolvedC
 def hindsight(session: Session, pipeline: Pipeline) -> Callable[[int], Observations]:
     """The flow observations up to a stamp by the RTS smoother, for `sampler.method = "smoothed"`.
 
-    Raises
-    ------
-    UsageError : the observer is not the Kalman filter, whose model the smoother shares.
+    Raises UsageError: the observer is not the Kalman filter, whose model the smoother shares.
     """
     if "kalman" not in OBSERVERS[pipeline.observer.method].options:
         able = " or ".join(f"'{row.name}'" for row in OBSERVERS.values() if "kalman" in row.options)

@@ -11,15 +11,11 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from flowrec.core import UsageError
+from flowrec.core import UsageError, needs
 from flowrec.verbs.listed import unknown_name
 
-try:
+with needs("a condition of find or ls --where", "catalog", "DuckDB"):
     import duckdb
-except ModuleNotFoundError as error:
-    raise UsageError(
-        "find and ls --where need DuckDB, which is not installed: pip install 'flowrec[catalog]'"
-    ) from error
 
 AS_LIST = "[]"  # behind the name of a column of LISTS: its list rather than its text
 SqlError = duckdb.Error
@@ -43,15 +39,13 @@ def connect() -> Any:
 class SessionTable:
     """The filled table `sessions` of a connection, closed to all else from now on.
 
+    `columns`: names that a condition can use.
+
     Parameters
     ----------
     option : of the command line that holds the condition, for complaints.
     key : column that tells the rows apart and orders them; a condition need not know it.
     relations : columns that are lists of structures, and what a complaint says of a member that they do not have.
-
-    Attributes
-    ----------
-    columns : names that a condition can use.
     """
 
     def __init__(self, connection: Any, option: str, key: str, relations: Mapping[str, str] | None = None) -> None:
@@ -67,17 +61,14 @@ class SessionTable:
         """Names of the columns that a condition mentions, and the rows that fulfil it, a dict of all columns each.
 
         A row has each mentioned column; relations are mentioned by a member, as in `sweep.refine`, and a session then
-        has a row for each of its replays or events; one without any has one row, in which they are unknown.
+        has a row for each of its replays or events; one without any has one row, in which they are unknown. Raises
+        UsageError: DuckDB refuses the condition, or no column has the name of `sort`.
 
         Parameters
         ----------
         where : SQL condition over the columns; '' chooses all.
         sort : a column, with a leading `-` from the largest; unknown values come last.
         limit : of the number of rows.
-
-        Raises
-        ------
-        UsageError : DuckDB refuses the condition, or no column has the name of `sort`.
         """
         mentioned = self._columns_in(where) if where else []
         key = sort.removeprefix("-").strip().lower()

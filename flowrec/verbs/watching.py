@@ -86,9 +86,7 @@ class Watching:
 def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool = False) -> None:
     """Show a run that another process records, from the beginning of its file until it ends or Ctrl-C.
 
-    Parameters
-    ----------
-    console : serve a page that steers it, too.
+    `console`: serve a page that steers it, too.
 
     Raises
     ------

@@ -26,20 +26,13 @@ _POLL_S = 0.1
 
 
 class Way(NamedTuple):
-    """A way out.
+    """A way out."""
 
-    Attributes
-    ----------
-    name : as in the key of an answer.
-    text : for people.
-    leave : does it, to the recorder of a session; the coils have to go to zero from then on.
-    limit_s : time that it may take.
-    """
-
-    name: str
-    text: str
+    name: str  # as in the key of an answer
+    text: str  # for people
+    # does it, to the recorder of a session; the coils have to go to zero from then on
     leave: Callable[[Day, subprocess.Popen[bytes], Path], object]
-    limit_s: Callable[[ResolvedConfig], float]
+    limit_s: Callable[[ResolvedConfig], float]  # time that it may take
 
 
 def _by_operator(_day: Day, _process: subprocess.Popen[bytes], session: Path) -> None:
@@ -75,9 +68,7 @@ WAYS = (
 def zero_on_ways(day: Day) -> tuple[float, float, str]:
     """The longest time of all ways in % of what it may take, 100, and all of them as text.
 
-    Raises
-    ------
-    FlowrecError : the time of a way is not known: nobody has read it, or its run made no field.
+    Raises FlowrecError: the time of a way is not known: nobody has read it, or its run made no field.
     """
     shares, told = [], []
     for way in WAYS:

@@ -83,9 +83,7 @@ class Trail:
 class Layer:
     """Lines that stay for many images, as colours with opacities.
 
-    Parameters
-    ----------
-    shape : rows and columns.
+    `shape`: rows and columns.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:

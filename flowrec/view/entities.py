@@ -166,13 +166,8 @@ class ColumnBuffer:
 class EntityLogger:
     """Logs the entities of one session below `prefix`: '', or one of REPLAY or PAIR.
 
-    Parameters
-    ----------
-    columns : takes the rows of moving entities, which are written when it is flushed; None: they are sent at once.
-
-    Attributes
-    ----------
-    present : the OPTIONAL entities, and those of extra topics, that were ever logged.
+    `columns`: takes the rows of moving entities, which are written when it is flushed; None: they are sent at once.
+    `present`: the OPTIONAL entities, and those of extra topics, that were ever logged.
     """
 
     def __init__(self, stream: rr.RecordingStream, prefix: str, columns: ColumnBuffer | None = None) -> None:

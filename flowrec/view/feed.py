@@ -34,22 +34,17 @@ _FIELDS = tuple(field.name for field in fields(Tick))
 
 
 class Batch(NamedTuple):
-    """Changes since the last batch.
+    """Changes since the last batch."""
 
-    Attributes
-    ----------
-    step : of the last tick's image only each `step`-th row and column is sent; the other ticks have no image.
-    changes : the fields of each tick that differ from the tick before.
-    remarks : what the run tells besides its ticks.
-    """
-
-    step: int
-    changes: list[dict[str, Any]]
-    remarks: dict[str, Any]
+    step: int  # of the last tick's image only each `step`-th row and column is sent; the other ticks have no image
+    changes: list[dict[str, Any]]  # the fields of each tick that differ from the tick before
+    remarks: dict[str, Any]  # what the run tells besides its ticks
 
 
 class Feed:
     """A process that reads pickled objects from its stdin: first `first`, then batches.
+
+    Raises OSError: the process does not start.
 
     Parameters
     ----------
@@ -58,10 +53,6 @@ class Feed:
     shown : the fields of a tick that are sent.
     remarks : asked for each batch, by the thread.
     answers : whether the process writes to a pipe, `process.stdout`; otherwise all its output goes to its log.
-
-    Raises
-    ------
-    OSError : the process does not start.
     """
 
     def __init__(
@@ -128,9 +119,7 @@ class Feed:
     def close(self, timeout_s: float, stays: str = "", last: object = None) -> bool:
         """Send the last ticks and `last` within a time limit, then end the process; whether it stays instead.
 
-        Parameters
-        ----------
-        stays : words by which the process says that it will end by itself.
+        `stays`: words by which the process says that it will end by itself.
         """
         self._last = last
         self._closing.set()

@@ -70,10 +70,7 @@ class ColourBar:
     """Position of the colour bar beside a map, in the picture plane.
 
     It is to the right of the channels, a little lower; of a very flat chip not shorter than a third of its width.
-
-    Attributes
-    ----------
-    bounds : left, top, right, bottom of the channels together with the bar and its numbers.
+    `bounds`: left, top, right, bottom of the channels together with the bar and its numbers.
     """
 
     def __init__(self, scene: Scene) -> None:

@@ -35,9 +35,7 @@ _FASTEST = 0.99  # quantile of the speeds that has this length
 class Overlay:
     """Draws the ticks of one session in order.
 
-    Parameters
-    ----------
-    image_px : width and height of the camera's images.
+    `image_px`: width and height of the camera's images.
 
     Attributes
     ----------

@@ -35,7 +35,7 @@ def write_rrd(
     progress: Callable[[float], None] = lambda _: None,
     summary: rr.TextDocument | None = None,
 ) -> None:
-    """Write the ticks of a session, or of two in one view.
+    """Write the ticks of a session, or of two in one view. Raises OSError: the file can not be written.
 
     Parameters
     ----------
@@ -43,10 +43,6 @@ def write_rrd(
         another session.
     progress : called from time to time with the session time in s since the first tick.
     summary : shown beside the pictures.
-
-    Raises
-    ------
-    OSError : the file can not be written.
     """
     stream = open_stream(scene)
     try:

@@ -33,20 +33,13 @@ def screenshot(
 ) -> list[str]:
     """Save what the viewer shows of a file (.rrd or .mcap) at a session time, by default at its end.
 
-    Returns the problems that the views report, one line each; normally none.
-
-    Raises
-    ------
-    FlowrecError : there is no viewer, no graphics driver, or the viewer does not read the file; OutputError if the
-        picture may not be written.
+    Returns the problems that the views report, one line each; normally none. Raises FlowrecError: there is no viewer,
+    no graphics driver, or the viewer does not read the file; OutputError if the picture may not be written.
     """
     path = Path(path).resolve()
     if not path.exists():
         raise FlowrecError(f"{path}: no such file")
-    with (
-        Output(Path(out_png), PICTURE, (path,), overwrite).new_file() as part,
-        _headless(size) as (client, began),
-    ):
+    with Output(Path(out_png), PICTURE, (path,), overwrite).new_file() as part, _headless(size) as (client, began):
         client.open(path.as_uri())
         state = viewer.until(lambda: _wait_loaded(client), _LOAD_S)
         if state is None:

@@ -50,9 +50,7 @@ class StatusBar:
     def set_legend(self, *, goal: bool, route: bool, flow: tuple[str, float, float] | None) -> None:
         """Set the entries of the legend besides the robot.
 
-        Parameters
-        ----------
-        flow : words before its arrow's speed, such as "refined flow", that speed in um/s, and px per um/s.
+        `flow`: words before its arrow's speed, such as "refined flow", that speed in um/s, and px per um/s.
         """
         r, middle = 0.34 * self._letter, 0.5 * self._height
         centre = np.array([1.2 * r, middle])

@@ -97,11 +97,8 @@ def url(port: int) -> str:
 def start(arguments: list[str], log: Path | None = None) -> subprocess.Popen[bytes]:
     """Start the viewer with its server on the loopback interface only, in a session of its own.
 
-    Ctrl-C in the terminal does not reach it, so it can outlive the run and show its end.
-
-    Raises
-    ------
-    OSError : there is no viewer, or it does not start.
+    Ctrl-C in the terminal does not reach it, so it can outlive the run and show its end. Raises OSError: there is no
+    viewer, or it does not start.
     """
     program = executable()
     if program is None:
@@ -155,10 +152,7 @@ def open_viewer(path: Path | str) -> str:
 def serve_recordings(recordings: Sequence[Path], port: int | None = None) -> Iterator[str]:
     """Serve recordings as a dataset for as long as the block runs; yields the URL for Rerun and its clients.
 
-    Raises
-    ------
-    UsageError : the server's packages are not installed.
-    FlowrecError : the server does not start.
+    Raises UsageError: the server's packages are not installed; FlowrecError: the server does not start.
     """
     if importlib.util.find_spec("datafusion") is None:
         raise UsageError("--serve needs Rerun's catalog, which is not installed: pip install 'flowrec[catalog]'")

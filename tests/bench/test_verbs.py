@@ -1,4 +1,4 @@
-"""The command line of the benches: options are those of `measure`, and moved benches say where they are."""
+"""The command line of the benches: options are those of `measure`."""
 
 import inspect
 import json
@@ -14,8 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from flowrec.bench import harness
-from flowrec.bench.bench_verb import BENCHES, MOVED, bench
-from flowrec.core.errors import UsageError
+from flowrec.bench.bench_verb import BENCHES, bench
 from flowrec.core.system.endings import Ended
 
 PERF = sorted(path.stem for path in (Path(__file__).parents[1] / "perf").glob("*.py"))
@@ -35,15 +34,6 @@ def test_the_help_of_a_bench_has_its_summary_and_the_options_of_its_measure(name
     module = import_module(f"flowrec.bench.{name}")
     renamed = {"folder", "k", "tree-channels", "tree-iterations", "sets"}  # declared with names of their own
     assert all(f"--{option}" in shown for option in options_of(module.measure) - renamed)
-
-
-@pytest.mark.parametrize("name", MOVED)
-def test_a_bench_that_has_moved_says_where_to(name):
-    with pytest.raises(UsageError, match=rf"has moved: run 'python -m {MOVED[name]} ") as refused:
-        CliRunner().invoke(bench, [name, "--quick", "word"], catch_exceptions=False)
-    assert "\n" not in str(refused.value)
-    place = Path(__file__).parents[2] / MOVED[name].replace(".", "/")
-    assert place.with_suffix(".py").exists() or (place / "__main__.py").exists()
 
 
 def test_results_that_count_faults_end_with_status_1_after_they_are_written(tmp_path):

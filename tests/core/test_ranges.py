@@ -141,10 +141,7 @@ def test_a_recorded_setting_outside_of_its_range_may_stay_but_not_be_set() -> No
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (
-            ["record", "--rig", "simulatd"],
-            "--rig: rig = 'simulatd': must be one of simulated",
-        ),
+        (["record", "--rig", "simulatd"], "--rig: rig = 'simulatd': must be one of simulated"),
         (["record", "--seed", "-1"], "--seed: simulated.seed = -1: must be from 0;"),
         (["record", "--duration", "-2"], "--duration: duration_s = -2: must be from 0.001"),
         (["record", "--duration", "nan"], "'--duration': nan is no number to work with"),

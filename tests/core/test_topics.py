@@ -70,10 +70,7 @@ ORDERS = {WorkOrder.SOLVE: ()}
             r"fields that do not exist: \['gone'\]",
         ),
         ({"extra": Annotated[Track | None, Topic("/extra", Source.STAGE, 1e-6, {"gone": 1.0})]}, "do not exist"),
-        (
-            {"extra": Annotated[Unshaped | None, Topic("/extra", Source.STAGE)]},
-            "Unshaped.points_um: declare its shape",
-        ),
+        ({"extra": Annotated[Unshaped | None, Topic("/extra", Source.STAGE)]}, "Unshaped.points_um: declare its shape"),
     ],
 )
 def test_a_mistake_in_the_declarations_of_tick_is_an_error_on_import(changed: dict[str, Any], complaint: str) -> None:

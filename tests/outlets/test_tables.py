@@ -132,9 +132,7 @@ def test_a_table_of_a_flow_has_the_velocity_of_each_place(
             np.testing.assert_allclose(spread, np.array(std) * (1.0 if column < p.KNOWN_COLUMNS else 10.0))
 
 
-def test_the_observed_flow_has_a_row_for_each_observation_and_is_read_back_as_it_was(
-    exported: dict[str, Path],
-) -> None:
+def test_the_observed_flow_has_a_row_for_each_observation_and_is_read_back_as_it_was(exported: dict[str, Path]) -> None:
     for kind, table in (
         ("csv", pyarrow.csv.read_csv(exported["csv"] / "observed_flow.csv")),
         ("parquet", pyarrow.parquet.read_table(exported["parquet"] / "observed_flow.parquet")),

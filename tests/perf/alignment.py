@@ -1,15 +1,12 @@
-"""`python -m tests.perf.alignment DIR`: the fit of a log to a movie beside two simple rivals, on the same missions.
+"""`python -m tests.perf.alignment DIR`: the fit of a log to a movie, on simulated missions.
 
 Each simulated mission is a track and a table of commands on a clock of its own, half of them with another rate. A track
-is given its own log, its own log after it was spoilt (see `spoilt`), and logs of other missions. All methods search the
-same offsets and rates. The thresholds of the rivals are those that make the fewest mistakes on the other half of the
-missions.
+is given its own log, its own log after it was spoilt (see `spoilt`), and logs of other missions.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -48,8 +45,6 @@ FAMILIES = {
     ),
     "slow": ("downstream.toml", ("robot.max_speed_um_s=250",)),
 }
-_LEAST_OVERLAP = 0.5
-_RATE_STEP = 0.6  # frames by which the ends of the movie move between two rates
 _WRONG_S = 0.02  # an accepted offset with a larger error is a mistake
 
 
@@ -72,8 +67,7 @@ class Found(NamedTuple):
     offset_s: float
     rate: float
     score: float
-    accepted: bool | None  # None: by a threshold of the score
-    why: str = ""  # it is refused
+    why: str  # it is refused; "": it is accepted
 
 
 def mission(folder: Path, family: str, seed: int) -> Mission:
@@ -125,87 +119,17 @@ def spoilt(given: Mission, rng: np.random.Generator) -> Mission:
     return replace(given, stamps_ns=stamps[kept], positions_um=positions[kept])
 
 
-def ours(given: Mission, log: FieldLog) -> Found:
+def fitted(given: Mission, log: FieldLog) -> Found:
     """The fit of `flowrec import --align`."""
     try:
         fit = fit_log(given.stamps_ns, given.positions_um, log, ANYWHERE, given.flow)
     except UsageError as error:
-        return Found(0.0, 1.0, 0.0, accepted=False, why=str(error))
-    return Found(fit.offset_s, fit.rate, fit.explained, not fit.refusal, fit.refusal)
+        return Found(0.0, 1.0, 0.0, str(error))
+    return Found(fit.offset_s, fit.rate, fit.explained, fit.refusal)
 
 
-def _correlated(pick: Callable[[Floats, Floats], tuple[Floats, Floats]], given: Mission, log: FieldLog) -> Found:
-    """The largest correlation of two series (n, d) of velocities, um/s and revolutions per second.
-
-    Parameters
-    ----------
-    pick : makes the series of velocity (n, 2) and rotation (m, 2).
-    """
-    times_s = given.stamps_ns / NS_PER_S
-    step_s = float(np.median(np.diff(times_s)))
-    grid = np.arange(times_s[0], times_s[-1], step_s)
-    way = np.column_stack([np.interp(grid, times_s, given.positions_um[:, axis]) for axis in (0, 1)])
-    velocity = np.diff(way, axis=0) / step_s
-    begin_s, end_s = log.times_ns[0] / NS_PER_S, log.times_ns[-1] / NS_PER_S
-    n, best = len(velocity), Found(0.0, 1.0, -1.0, accepted=None)
-    span = math.log(ANYWHERE.largest_rate)
-    step = _RATE_STEP / (n / 2)
-    for k in range(-int(span / step), int(span / step) + 1):
-        rate = math.exp(k * step)
-        least = max(int(_LEAST_OVERLAP * min(n, (end_s - begin_s) / (step_s * rate))), 3)
-        first_s = begin_s - (n - least) * step_s * rate
-        lags = max(int((end_s - begin_s) / (step_s * rate)) + n - 2 * least, 3)
-        at_ns = (first_s + step_s * rate * np.arange(lags + n)) * NS_PER_S
-        rotation = np.diff(log.turns_until(np.minimum(at_ns, log.times_ns[-1])), axis=0) / (step_s * rate)
-        moved, turned = pick(velocity, rotation)
-        score = _normalised(moved, turned, lags)
-        lag = int(np.argmax(score))
-        if score[lag] > best.score:
-            near = score[lag - 1 : lag + 2] if 0 < lag < lags - 1 else np.array([0.0, 1.0, 0.0])
-            bend = near[0] - 2.0 * near[1] + near[2]
-            part = 0.5 * float((near[0] - near[2]) / bend) if bend < 0.0 else 0.0
-            offset_s = first_s + (lag + part) * step_s * rate - rate * float(grid[0])
-            best = Found(offset_s, rate, float(score[lag]), accepted=None)
-    return best
-
-
-def _normalised(moved: Floats, turned: Floats, lags: int) -> Floats:
-    """(lags,) correlation coefficients of (n, d) with each stretch of (lags + n - 1, d), means taken off."""
-    n = len(moved)
-    moved = moved - moved.mean(0)
-    size = 1 << (len(turned) + n).bit_length()
-    ones, total = np.zeros((size, 1)), np.zeros(lags)
-    ones[:n] = 1.0
-
-    def slide(left: Floats, right: Floats) -> Floats:
-        product = np.conj(np.fft.rfft(left, size, axis=0)) * np.fft.rfft(right, size, axis=0)
-        return np.asarray(np.fft.irfft(product, size, axis=0)[:lags], np.float64)
-
-    total = slide(moved, turned).sum(1)
-    energy = (slide(ones, turned**2) - slide(ones, turned) ** 2 / n).sum(1)
-    floor = 1e-6 * max(float(energy.max()), 1e-300)
-    return np.where(energy > floor, total / np.sqrt(np.maximum(energy, floor) * max((moved**2).sum(), 1e-300)), 0.0)
-
-
-def by_speed(given: Mission, log: FieldLog) -> Found:
-    """The null model: speed of the track against the commanded frequency."""
-    return _correlated(lambda v, f: (np.hypot(*v.T)[:, None], np.hypot(*f.T)[:, None]), given, log)
-
-
-def by_velocity(given: Mission, log: FieldLog) -> Found:
-    """Both components of the velocity against those of the commanded rotation; the axes of the log must be right."""
-    return _correlated(lambda v, f: (v, f), given, log)
-
-
-METHODS: dict[str, Callable[[Mission, FieldLog], Found]] = {
-    "flowrec": ours,
-    "velocity": by_velocity,
-    "speed": by_speed,
-}
-
-
-def measured(missions: list[Mission], foreign: int, names: tuple[str, ...]) -> list[dict[str, Any]]:
-    """One row for each case and method."""
+def measured(missions: list[Mission], foreign: int) -> list[dict[str, Any]]:
+    """One row for each case."""
     rows: list[dict[str, Any]] = []
     with progress("cases", len(missions)) as done:
         for number, one in enumerate(missions):
@@ -231,38 +155,17 @@ def measured(missions: list[Mission], foreign: int, names: tuple[str, ...]) -> l
                 log = source.log.shift_clock(nanoseconds(shift_s))
                 middle_s = float(given.stamps_ns.mean()) / NS_PER_S
                 true_s = rate * middle_s + shift_s - one.delay_s
-                for name in names:
-                    found = METHODS[name](given, log)
-                    error_s = found.offset_s + found.rate * middle_s - true_s
-                    rows.append(
-                        {
-                            "fold": number // 2 % 2, "mission": f"{one.family} {one.seed}", "log": source.seed,
-                            "case": kind, "own": kind.startswith("own"), "method": name, "score": found.score,
-                            "accepted": found.accepted, "error_s": error_s, "rate_error": found.rate / rate - 1.0,
-                            "why": found.why,
-                        }
-                    )  # fmt: skip
+                found = fitted(given, log)
+                error_s = found.offset_s + found.rate * middle_s - true_s
+                rows.append(
+                    {
+                        "mission": f"{one.family} {one.seed}", "log": source.seed, "case": kind,
+                        "own": kind.startswith("own"), "score": found.score, "accepted": not found.why,
+                        "error_s": error_s, "rate_error": found.rate / rate - 1.0, "why": found.why,
+                    }
+                )  # fmt: skip
             done(number + 1)
-    for name in names:
-        mine = [row for row in rows if row["method"] == name]
-        if mine and mine[0]["accepted"] is None:
-            for fold in (0, 1):
-                least = _threshold([row for row in mine if row["fold"] != fold])
-                for row in mine:
-                    if row["fold"] == fold:
-                        row["accepted"] = row["score"] >= least
     return rows
-
-
-def _threshold(rows: list[dict[str, Any]]) -> float:
-    """The score from which on a fit is accepted with the fewest mistakes."""
-    right = {id(row): row["own"] and abs(row["error_s"]) < _WRONG_S for row in rows}
-    scores = sorted({row["score"] for row in rows}) or [0.0]
-
-    def mistakes(least: float) -> int:
-        return sum((row["score"] >= least) != right[id(row)] for row in rows)
-
-    return min([*scores, scores[-1] + 1e-9], key=mistakes)
 
 
 def measure(
@@ -270,9 +173,8 @@ def measure(
     count: Annotated[int, typer.Option(min=2, help="Missions of each family.")] = 10,
     first: Annotated[int, typer.Option(min=0, help="First seed.")] = 1000,
     foreign: Annotated[int, typer.Option(min=1, help="Logs of other runs of each kind, for each mission.")] = 1,
-    methods: Annotated[str, typer.Option(help="Comma-separated names of methods.")] = ",".join(METHODS),
 ) -> Results:
-    """Errors, false refusals and false acceptances of each method."""
+    """Errors, false refusals and false acceptances."""
     folder.mkdir(parents=True, exist_ok=True)
     missions = []
     with progress("missions", count * len(FAMILIES)) as done:
@@ -280,32 +182,23 @@ def measure(
             for family in FAMILIES:
                 missions.append(mission(folder, family, first + number))
                 done(len(missions))
-    return {"rows": measured(missions, foreign, tuple(methods.split(",")))}
+    return {"rows": measured(missions, foreign)}
 
 
 def show(results: Results) -> None:
-    """One line for each case and method."""
+    """One line for each case."""
     rows = results["rows"]
     cells = []
     for case in dict.fromkeys(row["case"] for row in rows):
-        for method in dict.fromkeys(row["method"] for row in rows):
-            mine = [row for row in rows if (row["case"], row["method"]) == (case, method)]
-            accepted = [row for row in mine if row["accepted"]]
-            errors_ms = 1e3 * np.abs([row["error_s"] for row in mine])
-            own = mine[0]["own"]
-            wrong = sum(abs(row["error_s"]) >= _WRONG_S for row in accepted) if own else len(accepted)
-            cells.append(
-                (
-                    case, method, str(len(mine)), f"{len(accepted)}", f"{wrong}",
-                    f"{np.median(errors_ms):.2f}, {np.quantile(errors_ms, 0.95):.3g}" if own else "",
-                    f"{(errors_ms <= 3.0).mean():.0%}" if own else "",
-                )
-            )  # fmt: skip
-    table(
-        "Log against movie",
-        ("log", "method", "cases", "accepted", "of these wrong", "offset error ms: median, 95 %", "within 3 ms"),
-        cells,
-    )
+        mine = [row for row in rows if row["case"] == case]
+        accepted = [row for row in mine if row["accepted"]]
+        errors_ms = 1e3 * np.abs([row["error_s"] for row in mine])
+        own = mine[0]["own"]
+        wrong = sum(abs(row["error_s"]) >= _WRONG_S for row in accepted) if own else len(accepted)
+        offset = (f"{np.median(errors_ms):.2f}, {np.quantile(errors_ms, 0.95):.3g}", f"{(errors_ms <= 3.0).mean():.0%}")
+        cells.append((case, str(len(mine)), str(len(accepted)), str(wrong), *(offset if own else ("", ""))))
+    columns = ("log", "cases", "accepted", "of these wrong", "offset error ms: median, 95 %", "within 3 ms")
+    table("Log against movie", columns, cells)
 
 
 if __name__ == "__main__":

@@ -61,9 +61,7 @@ class Killed:
 def trial(folder: Path) -> Killed:
     """One run from its start to the goal, whose camera is killed on the way.
 
-    Raises
-    ------
-    AssertionError : the run did not come so far.
+    Raises AssertionError: the run did not come so far.
     """
     config = load_config(None, [*COMMON, "camera.rate_hz=40.0", "simulated.seed=5"])
     chip = load_chip(config.chip)

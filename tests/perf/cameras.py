@@ -10,13 +10,12 @@ of the intervals. Slope: time of the host per time of the camera's clock.
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,9 +24,8 @@ import mm_test_adapters
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, run
+from flowrec.bench.harness import Results, print_rows, run
 from flowrec.core.clocks.device_clock import envelope
-from flowrec.core.terminal import table
 from flowrec.core.units import NS_PER_S
 from flowrec.rigs.lab.cameras.camera import Camera, Grabbed, Wanted
 from flowrec.rigs.lab.cameras.genicam import GenicamCamera
@@ -36,12 +34,12 @@ from flowrec.rigs.lab.cameras.mmcore import MmcoreCamera
 from flowrec.rigs.lab.cameras.pylon import PylonCamera
 from flowrec.store.session import Session
 from tests.perf.camera_killed import trial
+from tests.perf.guardian import busy
 from tests.rigs.lab.cameras.watching import adds_up
 from tests.twins.emulator import emulated, showing
 from tests.twins.gige import Aravis, port
 
 WANTED = Wanted(width_px=512, height_px=512, rate_hz=60.0, exposure_s=0.004)
-_BURN = "while True: pass"
 
 
 class WatchedGenicam(GenicamCamera):
@@ -89,18 +87,6 @@ def figures(grabber: Grabber, frames: list[Captured], agree: str = "") -> Result
         "arrival_max_ms": float(intervals_ms.max()),
         "slope": envelope(points)[1] * ticks_per_s / NS_PER_S if len(points) > 1 and ticks_per_s else 0.0,
     }
-
-
-@contextmanager
-def busy(processes: int) -> Iterator[None]:
-    """Other processes that never wait."""
-    burning = [subprocess.Popen([sys.executable, "-c", _BURN]) for _ in range(processes)]
-    try:
-        yield
-    finally:
-        for process in burning:
-            process.kill()
-            process.wait()
 
 
 def aravis(
@@ -151,10 +137,7 @@ def two_aravis(duration_s: float) -> Results:
     return (
         rows[0]
         | {key: rows[0][key] + rows[1][key] for key in sums}
-        | {
-            "adds_up": rows[0]["adds_up"] and rows[1]["adds_up"],
-            "hz": min(row["hz"] for row in rows),
-        }
+        | {"adds_up": rows[0]["adds_up"] and rows[1]["adds_up"], "hz": min(row["hz"] for row in rows)}
     )
 
 
@@ -271,42 +254,41 @@ def show(results: Results) -> None:
     """Print the tables."""
     load = "load {:.1f} to {:.1f} on {} cores".format(*results["load"], os.cpu_count())
     if "recorded" in results:
-        table(
+        print_rows(
             f"A camera killed in a mission with its coils on ({load})",
-            ["field off s after it", "field on s after the camera's start", "outcome"],
-            [[f"{row['off_s']:.2f}", f"{row['back_s']:.2f}", row["outcome"]] for row in results["recorded"]],
+            results["recorded"],
+            {
+                "field off s after it": "{off_s:.2f}",
+                "field on s after the camera's start": "{back_s:.2f}",
+                "outcome": "{outcome}",
+            },
         )
         return
-    table(
+    print_rows(
         f"What became of the blocks ({load})",
-        ["", "ids", "frames", "link, incomplete, driver, queue", "adds up", "library", "Hz", "arrival ms", "slope"],
-        [
-            [
-                name,
-                str(row["ids"]),
-                str(row["frames"]),
-                ", ".join(str(row[key]) for key in ("link", "incomplete", "driver", "backlog")),
-                "yes" if row["adds_up"] else "NO",
-                row["library"],
-                f"{row['hz']:.1f}",
-                f"{row['arrival_p99_ms']:.0f} {row['arrival_max_ms']:.0f}",
-                f"{row['slope']:.5f}" if row["slope"] else "-",
-            ]
-            for name, row in results["rows"].items()
-        ],
+        [{"name": name, **row} for name, row in results["rows"].items()],
+        {
+            "": "{name}",
+            "ids": "{ids}",
+            "frames": "{frames}",
+            "link, incomplete, driver, queue": "{link}, {incomplete}, {driver}, {backlog}",
+            "adds up": "{adds_up}",
+            "library": "{library}",
+            "Hz": "{hz:.1f}",
+            "arrival ms": "{arrival_p99_ms:.0f} {arrival_max_ms:.0f}",
+            "slope": "{slope:.5f}",
+        },
     )
-    table(
+    names = {"killed": "killed (kill -9)", "frozen": "cable pulled (SIGSTOP)"}
+    print_rows(
         "A camera that is gone",
-        ["", "trials", "recognised s", "resumed s after it is back"],
-        [
-            [
-                name,
-                str(results[key]["trials"]),
-                "{:.2f} to {:.2f}".format(*results[key]["recognised_s"]),
-                "{:.2f} to {:.2f}".format(*results[key]["resumed_s"]),
-            ]
-            for name, key in (("killed (kill -9)", "killed"), ("cable pulled (SIGSTOP)", "frozen"))
-        ],
+        [{"name": name, **results[key]} for key, name in names.items()],
+        {
+            "": "{name}",
+            "trials": "{trials}",
+            "recognised s": "{recognised_s[0]:.2f} to {recognised_s[1]:.2f}",
+            "resumed s after it is back": "{resumed_s[0]:.2f} to {resumed_s[1]:.2f}",
+        },
     )
 
 

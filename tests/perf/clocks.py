@@ -1,4 +1,4 @@
-"""`python -m tests.perf.clocks`: errors of frame stamps by five ways to fit a camera's clock to the host's.
+"""`python -m tests.perf.clocks`: errors of frame stamps by the fit of a camera's clock to the host's, and by arrival.
 
 The series are simulated, so the truth is known: a camera at 100 Hz for some minutes, its clock 50 ppm fast, frames that
 arrive at least 0.2 ms late, and one fault per series.
@@ -15,36 +15,27 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from flowrec.bench.harness import Results, Seed, run
-from flowrec.core.clocks.device_clock import DeviceClock, Fit, envelope
-from flowrec.core.terminal import table
+from flowrec.bench.harness import Results, Seed, print_rows, run
+from flowrec.core.clocks.device_clock import DeviceClock, Fit
 from flowrec.core.units import NS_PER_S
 
 _RATE_HZ = 100.0
 _SKEW = 50e-6
 _LEAST_S, _JITTER_S = 200e-6, 300e-6  # of the way to the host: at the least, and the mean of what comes on top
-_WINDOW, _EVERY = 6000, 50  # frames that the others look back on, and after how many they fit anew
 _SETTLED_S = 15.0  # from then on a series is judged, and from so long after something went wrong
 _EPOCH = 1_234_567_890_123
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Frames as they arrive.
-
-    Attributes
-    ----------
-    true_ns : (n,) when each was taken and could have been here at the earliest, ns on the host's clock.
-    device : counts of the camera's clock, n of them.
-    arrival_ns : n, in the order of arrival.
-    events_s : when something went wrong that a new fit has to be begun for.
-    """
+    """Frames as they arrive."""
 
     name: str
+    # (n,) when each was taken and could have been here at the earliest, ns on the host's clock
     true_ns: NDArray[np.int64]
-    device: list[int]
-    arrival_ns: list[int]
-    events_s: tuple[float, ...] = ()
+    device: list[int]  # counts of the camera's clock, n of them
+    arrival_ns: list[int]  # n, in the order of arrival
+    events_s: tuple[float, ...] = ()  # when something went wrong that a new fit has to be begun for
 
 
 def series(name: str, seconds: float = 300.0, seed: int = 0) -> Series:
@@ -154,78 +145,23 @@ def said_of(fit: Fit) -> str:
     return ", ".join([f"unit {fit.unit:.3g}" for _ in range(fit.unit > 0.0)] + parts)
 
 
-def _windowed(line: Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[float, float]]) -> Any:
-    """A line fitted every half second to the same window as that of flowrec, and nothing else."""
-
-    def dated(one: Series) -> tuple[NDArray[np.float64], str]:
-        x = np.array(one.device, np.float64)
-        y = np.array(one.arrival_ns, np.float64)
-        stamps = y.copy()
-        slope, level = 1.0, y[0] - x[0]
-        for n in range(len(x)):
-            if n % _EVERY == 0 and n >= 500:
-                begin = max(0, n - _WINDOW)
-                x0, y0 = x[begin], y[begin]
-                slope, level = line(x[begin:n] - x0, y[begin:n] - y0)
-                level += y0 - slope * x0
-            stamps[n] = level + slope * x[n]
-        return stamps, ""
-
-    return dated
-
-
-def _least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    dx = x - x.mean()
-    slope = float((dx * y).sum() / max((dx * dx).sum(), 1.0))
-    return slope, float(y.mean() - slope * x.mean())
-
-
-def _median(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Median of the slopes over half of the window (after Theil and Sen), and of the levels."""
-    half = len(x) // 2
-    apart = x[half:] - x[: len(x) - half]
-    slopes = (y[half:] - y[: len(y) - half])[apart != 0] / apart[apart != 0]
-    slope = float(np.median(slopes)) if len(slopes) else 1.0
-    return slope, float(np.median(y - slope * x))
-
-
-def _hull(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    points = dict(sorted(zip(x.astype(int).tolist(), y.astype(int).tolist(), strict=True), reverse=True))
-    support, slope = envelope(tuple(sorted(points.items())))
-    return slope, support[1] - slope * support[0]
-
-
-METHODS: dict[str, Callable[[Series], tuple[NDArray[np.float64], str]]] = {
-    "arrival": _arrival,
-    "least squares": _windowed(_least_squares),
-    "median": _windowed(_median),
-    "hull": _windowed(_hull),
-    "flowrec": _ours,
-}
+METHODS: dict[str, Callable[[Series], tuple[NDArray[np.float64], str]]] = {"arrival": _arrival, "flowrec": _ours}
 
 
 def show(figures: dict[str, Any]) -> None:
     """Print the table."""
-    rows = [
-        (
-            row["case"],
-            row["method"],
-            *(_told(row[name]) for name in ("mean_s", "rms_s", "p99_s", "max_s", "step_s")),
-            str(row["backwards"]),
-            f"{row['us_per_frame']:.1f}",
-            row["said"],
-        )
-        for row in figures["rows"]
-    ]
-    table(
+    print_rows(
         f"Errors of stamps in us, {figures['rate_hz']:g} Hz for {figures['seconds']:g} s, {figures['skew_ppm']:g} ppm",
-        ("case", "fit", "mean", "rms", "p99", "max", "step", "backwards", "us/frame", "detected"),
-        rows,
+        [row | {key[:-2]: 1e6 * value for key, value in row.items() if key.endswith("_s")} for row in figures["rows"]],
+        {
+            "case": "{case}",
+            "fit": "{method}",
+            **{name: f"{{{name}:.4g}}" for name in ("mean", "rms", "p99", "max", "step")},
+            "backwards": "{backwards}",
+            "us/frame": "{us_per_frame:.1f}",
+            "detected": "{said}",
+        },
     )
-
-
-def _told(error_s: float) -> str:
-    return f"{1e6 * error_s:.0f}" if abs(error_s) < 10.0 else f"{error_s:.0f} s"
 
 
 if __name__ == "__main__":

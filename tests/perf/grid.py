@@ -13,10 +13,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, run, vessel_cases
+from flowrec.bench.harness import Results, print_rows, run, vessel_cases
 from flowrec.bench.vessel_truth import read_true_chip, read_true_velocity
 from flowrec.core.errors import UsageError
-from flowrec.core.terminal import table
 from flowrec.physics.chip.io import read_vessel_case
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.stages.refine.discretisation_error import local_rms
@@ -67,11 +66,9 @@ def measure(
 
 def show(figures: dict[str, Any]) -> None:
     """Print the cases and the settings."""
-    rows = [
-        (row["case"], f"{row['share']:.2f}", f"{row['error']:.4f}", f"{row['left']:.4f}") for row in figures["rows"]
-    ]
     settings = ", ".join(f"{name} = {figures[name]:.3f}" for name in ("share", "share_std", "left_share"))
-    table(f"Error of the grid at k = {figures['k']}: {settings}", ("case", "share", "error", "left"), rows)
+    columns = {"case": "{case}", "share": "{share:.2f}", "error": "{error:.4f}", "left": "{left:.4f}"}
+    print_rows(f"Error of the grid at k = {figures['k']}: {settings}", figures["rows"], columns)
 
 
 if __name__ == "__main__":

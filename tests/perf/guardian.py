@@ -27,8 +27,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, run
-from flowrec.core.terminal import progress, table
+from flowrec.bench.harness import Results, print_rows, run
+from flowrec.core.terminal import progress
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from tests.perf import guardian_record, guardian_trial
 from tests.twins.coils import Device, device
@@ -273,37 +273,27 @@ def show(results: Results) -> None:
     """Print the tables."""
     if results["blocks"] is not None:
         print("NI blocks, every core busy:", results["blocks"])
-    table(
+    print_rows(
         f"time from the fault to zero; the timer is {1e3 * TIMER_S:.0f} ms; load {results['load']:.1f}",
-        (
-            "device",
-            "fault",
-            "trials",
-            "least, ms",
-            "median",
-            "90 %",
-            "most",
-            "delay of a sleep",
-            "late or on",
-            "not started",
-            "load",
-            "left (recovered)",
-        ),
         [
-            (
-                row["device"],
-                row["fault"],
-                str(len(row["off_s"])),
-                *(f"{1e3 * np.percentile(row['off_s'], q):.1f}" for q in (0, 50, 90, 100)),
-                f"{1e3 * row['sleep_s']:.1f}",
-                str(row["late"]),
-                str(row["not_started"]),
-                f"{row['load']:.1f}",
-                f"{', '.join(row['files'])} ({row['recovered']})" if "files" in row else "-",
-            )
+            {"files": "-", "recovered": "-"}
+            | row
+            | {"trials": len(row["off_s"]), "ms": 1e3 * np.percentile(row["off_s"], (0, 50, 90, 100))}
             for row in results["rows"]
             if row["off_s"]
         ],
+        {
+            "device": "{device}",
+            "fault": "{fault}",
+            "trials": "{trials}",
+            **{name: f"{{ms[{n}]:.1f}}" for n, name in enumerate(("least, ms", "median", "90 %", "most"))},
+            "sleep late by, s": "{sleep_s:.4f}",
+            "late or on": "{late}",
+            "not started": "{not_started}",
+            "load": "{load:.1f}",
+            "left": "{files}",
+            "recovered": "{recovered}",
+        },
     )
 
 

@@ -30,31 +30,22 @@ _HELD_US = 3_000_000
 
 @dataclass
 class Left:
-    """What became of one recorder.
+    """What became of one recorder."""
 
-    Attributes
-    ----------
-    off_s : from the fault to zero; None: never.
-    stayed_off : whether the field was still off when the recorder had gone on or ended.
-    file : what it left: 'partial' for an unfinished file, 'nothing saved' where nothing of it can be recovered; else
-        the outcome that the session states.
-    recovered_s : length of the session that `flowrec recover` makes of the unfinished file; None: it was not tried.
-    said : the last line of the recorder.
-    """
-
-    off_s: float | None
-    stayed_off: bool
+    off_s: float | None  # from the fault to zero; None: never
+    stayed_off: bool  # whether the field was still off when the recorder had gone on or ended
+    # what it left: 'partial' for an unfinished file, 'nothing saved' where nothing of it can be recovered; else the
+    # outcome that the session states
     file: str
+    # length of the session that `flowrec recover` makes of the unfinished file; None: it was not tried
     recovered_s: float | None
-    said: str
+    said: str  # the last line of the recorder
 
 
 def trial(on: Device, fault: str, folder: Path, camera: tuple[str, ...], name: str, *, recovers: bool) -> Left | None:
     """Start a recorder, wait until its field is on, and kill, stop or hold it; None: it had no field any more by then.
 
-    Raises
-    ------
-    AssertionError : what it left is a session that looks whole, or can not be recovered.
+    Raises AssertionError: what it left is a session that looks whole, or can not be recovered.
     """
     out, begin, errors = folder / f"{name}.mcap", on.end(), folder / f"{name}.stderr"
     module = "tests.perf.guardian_record" if fault == "held" else "flowrec"

@@ -19,10 +19,9 @@ import typer
 from numpy.typing import NDArray
 
 import flowrec
-from flowrec.bench.harness import Results, run
+from flowrec.bench.harness import Results, print_rows, run
 from flowrec.core.errors import FlowrecError
 from flowrec.core.messages import Track
-from flowrec.core.terminal import table
 from flowrec.physics.flow.sampling import relative_rmse
 from flowrec.stages.config import load_config, with_sets
 from flowrec.store.session import Session
@@ -185,15 +184,15 @@ def measure(
 
 def report(results: Results) -> None:
     """One line for each fault."""
-    cells = [
-        (
-            row["fault"], str(row["status"]),
-            "-" if row.get("refined") is None else f"{100 * row['unrefined']:.1f} -> {100 * row['refined']:.2f}",
-            "-" if row.get("track_um") is None else f"{row['track_um']:.2f}", row["said"],
-        )
-        for row in results["rows"]
-    ]  # fmt: skip
-    table("Imports of one run", ("fault", "status", "flow error %", "track um", "said"), cells, text="said")
+    rows = [{"unrefined": None, "refined": None, "track_um": None} | row for row in results["rows"]]
+    columns = {
+        "fault": "{fault}",
+        "status": "{status}",
+        "flow error": "{unrefined:.1%} -> {refined:.2%}",
+        "track um": "{track_um:.2f}",
+        "said": "{said}",
+    }
+    print_rows("Imports of one run", rows, columns, text="said")
 
 
 if __name__ == "__main__":

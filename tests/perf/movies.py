@@ -19,8 +19,8 @@ import numpy as np
 import typer
 
 import flowrec
-from flowrec.bench.harness import Results, run
-from flowrec.core.terminal import progress, table
+from flowrec.bench.harness import Results, print_rows, run
+from flowrec.core.terminal import progress
 from flowrec.physics.chip.io import chip_files
 from flowrec.physics.flow.sampling import relative_rmse, sample
 from flowrec.stages.config import Config, load_config
@@ -156,19 +156,21 @@ def measure(
 
 def report(results: Results) -> None:
     """One line for each movie."""
-    cells = [
-        (
-            str(row["seed"]), row["kind"], f"{row['seen']}/{row['images']}", f"{row['track_um']:.2f}",
-            f"{100 * row['unrefined']:.1f} -> {100 * row['refined']:.2f}",
-            f"{100 * row['own']:.2f}, {100 * row['exact']:.2f}", "yes" if row["verified"] else "NO",
-            "yes" if row["good"] else "NO", f"{row['mb']:.2f}", f"{row['import_s']:.1f}",
-        )
-        for row in results["rows"]
-    ]  # fmt: skip
-    table(
+    print_rows(
         "Imported movies",
-        ("seed", "kind", "seen", "track um", "flow error %", "own, exact %", "verified", "GOOD", "MB", "s"),
-        cells,
+        results["rows"],
+        {
+            "seed": "{seed}",
+            "kind": "{kind}",
+            "seen": "{seen}/{images}",
+            "track um": "{track_um:.2f}",
+            "flow error": "{unrefined:.1%} -> {refined:.2%}",
+            "own, exact": "{own:.2%}, {exact:.2%}",
+            "verified": "{verified}",
+            "GOOD": "{good}",
+            "MB": "{mb:.2f}",
+            "s": "{import_s:.1f}",
+        },
     )
 
 

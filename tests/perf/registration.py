@@ -2,10 +2,7 @@
 
 Every look of tests/physics/chip/looks.py and the simulated microscope, as it is and inverted, meets every
 transformation; chips and textures change from case to case. Then pictures that do not show the chip: how many are
-refused. With `--rivals`
-the search is compared with the log-polar FFT and the fit with OpenCV's ECC, from the same pictures and first poses.
-Of 20 pictures the best pose of our search is within 50 um (5 px) in 18 and takes 1.2 s, log-polar in 8 and 0.05 s. ECC
-is then within 5 um in 7 and our fit, of the poses that are accepted, in all.
+refused.
 
 FLOWREC_REFERENCE_DATA adds real vessels to the chips, and real images as textures (also `--textures DIR`).
 """
@@ -25,7 +22,6 @@ import numpy as np
 
 from flowrec.core.errors import ChipError
 from flowrec.measure.picture_registration import register
-from flowrec.measure.wall_search import WallMap, WallSearch
 from flowrec.physics.chip.chip import Chip, ChipSettings
 from flowrec.physics.chip.io import load_chip
 from flowrec.physics.chip.registration import Calibration
@@ -197,110 +193,11 @@ def refused(case: Stranger) -> dict[str, object]:
     return row | {"cpu_s": time.process_time() - began}
 
 
-def log_polar(case: Case) -> Calibration:
-    """The rival of the search: angle and scale by phase correlation of log-polar spectra, then the shift."""
-    side = 512
-    step = max(SIZE_PX) / side
-    um = case.about_um * step
-    grey = cv2.resize(case.image.astype(np.float32), None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
-    mask = case.chip.mask.astype(np.float32)
-    scale = case.chip.um_per_px / um
-    drawn = cv2.resize(mask, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-
-    def edges(image: np.ndarray) -> np.ndarray:
-        smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
-        size = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-        size = np.minimum(size / max(float(np.percentile(size, 99)), 1e-6), 1.0)
-        canvas = np.zeros((side, side), np.float32)
-        h, w = min(size.shape[0], side), min(size.shape[1], side)
-        top, left = (side - h) // 2, (side - w) // 2
-        canvas[top : top + h, left : left + w] = (size - size.mean())[:h, :w]
-        return canvas
-
-    def spectrum(canvas: np.ndarray) -> np.ndarray:
-        size = np.log1p(np.abs(np.fft.fftshift(np.fft.fft2(canvas * window))))
-        return cv2.warpPolar(size.astype(np.float32), (side, side), (side / 2,) * 2, side / 2, cv2.WARP_POLAR_LOG)
-
-    window = cv2.createHanningWindow((side, side), cv2.CV_32F)
-    target = edges(grey)
-    best, best_response = None, -1.0
-    for mirror in (False, True):
-        flat = edges(drawn[::-1] if mirror else drawn)
-        (dx, dy), _ = cv2.phaseCorrelate(spectrum(flat), spectrum(target), window)
-        ratio = np.exp(-dx * np.log(side / 2) / side)
-        for turn in (360.0 * dy / side, 360.0 * dy / side + 180.0):
-            matrix = cv2.getRotationMatrix2D(((side - 1) / 2,) * 2, -turn, ratio)
-            turned = cv2.warpAffine(flat, matrix, (side, side))
-            (sx, sy), response = cv2.phaseCorrelate(turned, target)
-            if response > best_response:
-                middle_um = np.array(case.chip.size_um) / 2 - case.chip.um_per_px / 2
-                at_px = step * (np.array(((grey.shape[1] - 1) / 2 + sx, (grey.shape[0] - 1) / 2 + sy)) + 0.5) - 0.5
-                first = Calibration(case.about_um / ratio, (0.0, 0.0), turn, mirror)
-                x, y = (middle_um - first.to_um(at_px)).tolist()
-                best, best_response = replace(first, origin_um=(x, y)), response
-    assert best is not None
-    return best
-
-
-def ecc(case: Case, start: Calibration) -> Calibration | None:
-    """The rival of the fit: OpenCV's ECC of edge images, affine; None if it does not converge."""
-    walls = WallMap(case.chip.mask, case.chip.um_per_px)
-    shape = case.chip.mask.shape
-    fine = 2
-    line = np.exp(-((walls.clearance_um / (0.5 * max(start.um_per_px, case.chip.um_per_px))) ** 2)).astype(np.float32)
-    line = cv2.resize(line, (fine * shape[1], fine * shape[0]), interpolation=cv2.INTER_CUBIC)
-    smooth = cv2.GaussianBlur(case.image.astype(np.float32), (0, 0), 1.0)
-    edge = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    fine_um = case.chip.um_per_px / fine
-    to_px = np.linalg.inv(np.vstack((start.matrix, (0, 0, 1))))
-    shift = 0.5 * fine_um * (1 - fine) * np.ones(2)  # of the centre of the first fine pixel
-    matrix = np.column_stack((to_px[:2, :2] * fine_um, to_px[:2, :2] @ shift + to_px[:2, 2])).astype(np.float32)
-    try:
-        _, found = cv2.findTransformECC(
-            line, edge, matrix, cv2.MOTION_AFFINE, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6), None, 5
-        )
-    except cv2.error:
-        return None
-    linear = found[:, :2] / fine_um
-    scale = np.sqrt(abs(np.linalg.det(linear)))
-    angle = np.degrees(np.arctan2(linear[1, 0], linear[0, 0]))
-    first = Calibration(float(1 / scale), (0.0, 0.0), float(angle), bool(np.linalg.det(linear) < 0))
-    at = found[:, :2] @ ((np.array((shape[1], shape[0])) * fine - 1) / 2) + found[:, 2]
-    middle_um = np.array(case.chip.size_um) / 2 - case.chip.um_per_px / 2
-    x, y = (middle_um - first.to_um(at)).tolist()
-    return replace(first, origin_um=(x, y))
-
-
-def rivals(case: Case) -> dict[str, object]:
-    walls = WallMap(case.chip.mask, case.chip.um_per_px)
-    t0 = time.process_time()
-    first = WallSearch(case.image.astype(np.float32), walls).candidates(
-        (case.about_um / 1.12, case.about_um * 1.12), (False, True), 4
-    )
-    t1 = time.process_time()
-    rival = log_polar(case)
-    t2 = time.process_time()
-    start = min((pose.calibration for pose in first), key=lambda c: errors(c, case.truth)["corner_um"])
-    refined = ecc(case, start)
-    t3 = time.process_time()
-    return {
-        "look": case.look,
-        "transformation": case.transformation,
-        "search_um": errors(start, case.truth)["corner_um"],
-        "search_s": t1 - t0,
-        "log_polar_um": errors(rival, case.truth)["corner_um"],
-        "log_polar_s": t2 - t1,
-        "ecc_um": errors(refined, case.truth)["corner_um"] if refined is not None else None,
-        "ecc_s": t3 - t2,
-    }
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--every", type=int, default=1, help="only every N-th case")
     parser.add_argument("--textures", type=Path, help="folder of PNG images")
-    parser.add_argument("--rivals", action="store_true")
     parser.add_argument("--refusals", action="store_true", help="only pictures without the chip")
     asked = parser.parse_args()
     laid = textures(asked.textures)
@@ -311,7 +208,7 @@ def main() -> None:
         return
     for number, case in enumerate(cases(asked.seed, laid)):
         if number % asked.every == 0:
-            print(json.dumps((rivals if asked.rivals else measure)(case)), flush=True)
+            print(json.dumps(measure(case)), flush=True)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 Pictures of chips in every look of tests/physics/chip/looks.py, in looks of this file and by the simulated microscope,
 in several poses; then pictures without a chip. Of each: accepted or refused, intersection over union with the true
 mask, distance of the walls from the true ones, and the error of the flow solved on the chip that was found, between the
-openings of the true one, at the same mean speed and at the same flux. `--rivals`: masks by scikit-image and OpenCV from
-the same pictures. `--textures DIR`: pictures (PNG) without a chip. FLOWREC_REFERENCE_DATA adds real vessels and images.
+openings of the true one, at the same mean speed and at the same flux. `--textures DIR`: pictures (PNG) without a chip.
+FLOWREC_REFERENCE_DATA adds real vessels and images.
 """
 
 from __future__ import annotations
@@ -231,48 +231,6 @@ def measure(case: Case, flow: bool = True) -> dict[str, Any]:
     return row
 
 
-def rivals(case: Case) -> dict[str, Any]:
-    """Masks of well-kept libraries from the same picture: IoU of the better side, which no user could choose for them.
-
-    GrabCut starts from Otsu's threshold of the levelled picture, Chan-Vese from a checkerboard; watershed and random
-    walker are told five points in the channel and five outside of it.
-    """
-    from skimage.segmentation import morphological_chan_vese, random_walker, watershed
-
-    assert case.truth is not None
-    height, width = case.image.shape
-    truth = cv2.resize(case.truth.astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA) > 0
-    grey = case.image.astype(np.float32)
-    light = np.log(grey + 0.02 * grey.max() + 1.0)
-    level = light - cv2.GaussianBlur(light, (0, 0), 60.0)
-    smooth = cv2.GaussianBlur(level, (0, 0), 1.5)
-    shown = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
-    otsu = cv2.threshold(shown, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[1]
-    rng, clicks = np.random.default_rng(0), np.zeros(truth.shape, np.int32)
-    for mark, part in ((1, truth), (2, ~truth)):
-        at = np.argwhere(cv2.erode(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
-        for row, column in at[rng.permutation(len(at))[:5]]:
-            clicks[row, column] = mark
-    steep = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    grab = np.where(otsu > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    cv2.grabCut(cv2.merge((shown,) * 3), grab, None, np.zeros((1, 65)), np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
-    masks = {
-        "otsu": otsu > 0,
-        "grab_cut": (grab & 1) > 0,
-        "chan_vese": morphological_chan_vese(smooth, 60, smoothing=2) > 0,
-        "watershed, clicks": watershed(steep, clicks) == 1,
-        "random_walker, clicks": random_walker(smooth, clicks, beta=1000, mode="cg_j") == 1,
-    }
-    row: dict[str, Any] = {"case": case.name}
-    for name, mask in masks.items():
-        row[name] = round(max(iou(np.asarray(side, np.bool_), truth) for side in (mask, ~mask)), 3)
-    try:
-        row["flowrec"] = round(iou(segment(case.image).outline.mask(), truth), 3)
-    except FlowrecError as error:
-        row["flowrec"] = str(error)[:40]
-    return row
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
@@ -281,16 +239,14 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--textures", type=Path, help="folder of pictures (PNG) without a chip")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
-    parser.add_argument("--rivals", action="store_true", help="masks by scikit-image and OpenCV instead")
     parser.add_argument("--refusals", action="store_true", help="only pictures without a chip")
     parser.add_argument("--no-flow", action="store_true", help="masks only")
     asked = parser.parse_args()
     made = cases(asked.seed, asked.longest, lambda number: number % asked.every == asked.first)
     others = list(without_chip(asked.seed, asked.longest, asked.textures))[asked.first :: asked.every]
-    for case in itertools.chain(() if asked.refusals else made, () if asked.rivals else others):
+    for case in itertools.chain(() if asked.refusals else made, others):
         if asked.only in case.name:
-            row = rivals(case) if asked.rivals else measure(case, not asked.no_flow)
-            print(json.dumps(row), flush=True)
+            print(json.dumps(measure(case, not asked.no_flow)), flush=True)
 
 
 if __name__ == "__main__":

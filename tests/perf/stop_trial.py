@@ -166,11 +166,7 @@ RIGS: dict[str, type[LoggedRig]] = {
     "zero-raises": _Raising,
     "zero-slow": _Slow,
 }
-STAGES: dict[str, Callable[[], None]] = {
-    "stage-raises": _raise,
-    "stage-for-ever": _for_ever,
-    "stage-in-c": _stuck_in_c,
-}
+STAGES: dict[str, Callable[[], None]] = {"stage-raises": _raise, "stage-for-ever": _for_ever, "stage-in-c": _stuck_in_c}
 
 
 def main(kind: str, out: str, log_path: str, *sets: str) -> None:

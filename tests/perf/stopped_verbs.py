@@ -24,8 +24,8 @@ import psutil  # type: ignore[import-untyped]
 import typer
 
 from flowrec.bench.flow import make_up
-from flowrec.bench.harness import Results, run
-from flowrec.core.terminal import progress, table
+from flowrec.bench.harness import Results, print_rows, run
+from flowrec.core.terminal import progress
 from flowrec.store.session_metadata import SessionMetadata
 
 ROOT = Path(__file__).parents[2]
@@ -58,9 +58,7 @@ VERBS = {
     "verify, 2 jobs": Verb("replay {a} --verify --jobs 2", "flowrec.verbs.replay_segments"),
     "refine": Verb("replay {a} --refine gain -o {out}/r.mcap", "flowrec.verbs.replay_made", ("r.mcap",)),
     "refly": Verb(
-        "replay {a} --refine gain --refly -o {out}/r.mcap",
-        "flowrec.verbs.replay_made",
-        ("r.mcap", "r_refly.mcap"),
+        "replay {a} --refine gain --refly -o {out}/r.mcap", "flowrec.verbs.replay_made", ("r.mcap", "r_refly.mcap")
     ),
     "check": Verb("check {a}", "flowrec.verbs.check_run"),
     "compare": Verb("compare {a} {b}", "flowrec.verbs.session_comparison"),
@@ -242,12 +240,7 @@ def _sessions(session: Path, folder: Path) -> dict[str, str]:
 
 
 def _rows(
-    title: str,
-    verb: Verb,
-    sessions: dict[str, str],
-    folder: Path,
-    imports: Sequence[float],
-    shares: Sequence[float],
+    title: str, verb: Verb, sessions: dict[str, str], folder: Path, imports: Sequence[float], shares: Sequence[float]
 ) -> Iterator[dict[str, Any]]:
     def words(out: Path) -> list[str]:
         out.mkdir()
@@ -285,23 +278,13 @@ def _rows(
 
 def show(results: Results) -> None:
     """Print the table."""
-    table(
-        f"{results['fault_count']} of {len(results['rows'])} trials with a fault",
-        ("verb", "signal", "moment", "status", "said", "left", "faults"),
-        [
-            (
-                row["verb"],
-                row["signal"],
-                row["moment"],
-                str(row["status"]),
-                row["said"][:100] if row["before_its_end"] else "had ended before the signal",
-                ", ".join(row["left"]),
-                "; ".join(row["faults"]),
-            )
-            for row in results["rows"]
-        ],
-        text="said",
-    )
+    rows = [
+        row | {"said": row["said"][:100] if row["before_its_end"] else "had ended before the signal"}
+        for row in results["rows"]
+    ]
+    names = ("verb", "signal", "moment", "status", "said", "left", "faults")
+    title = f"{results['fault_count']} of {len(rows)} trials with a fault"
+    print_rows(title, rows, {name: f"{{{name}}}" for name in names}, text="said")
 
 
 if __name__ == "__main__":

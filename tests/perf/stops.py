@@ -19,9 +19,9 @@ from typing import Annotated
 
 import typer
 
-from flowrec.bench.harness import Results, run
+from flowrec.bench.harness import Results, print_rows, run
 from flowrec.core.errors import FlowrecError
-from flowrec.core.terminal import progress, table
+from flowrec.core.terminal import progress
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 
@@ -210,20 +210,17 @@ def measure(
 
 def show(results: Results) -> None:
     """Print the table."""
-    table(
+    print_rows(
         f"{results['trials']} runs of each kind, worst times from the cause on",
-        ("kind", "field off, s", "timer, s", "process gone, s", "statuses", "files"),
-        [
-            (
-                name,
-                f"{row['field_off_s']:.3f}",
-                f"{row['timer_s']:g}",
-                f"{row['process_gone_s']:.2f}",
-                ", ".join(map(str, row["statuses"])),
-                ", ".join(f"{count} {state}" for state, count in row["files"].items()),
-            )
-            for name, row in results["rows"].items()
-        ],
+        [{"kind": kind, **row} for kind, row in results["rows"].items()],
+        {
+            "kind": "{kind}",
+            "field off, s": "{field_off_s:.3f}",
+            "timer, s": "{timer_s:g}",
+            "process gone, s": "{process_gone_s:.2f}",
+            "statuses": "{statuses}",
+            "files": "{files}",
+        },
     )
 
 

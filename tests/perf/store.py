@@ -17,8 +17,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, run
-from flowrec.core.terminal import progress, table
+from flowrec.bench.harness import Results, print_rows, run
+from flowrec.core.terminal import progress
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
@@ -167,74 +167,62 @@ def show(figures: dict[str, Any]) -> None:
     """Print the figures as tables."""
     if "run" in figures:
         show_soak(figures["run"])
-        ring = figures["soak_ring"]
         names = ("minutes", "file_mb", "dropped", "lowest_mb", "highest_mb", "growth_mb_per_minute")
-        rows = [(name.replace("_", " "), f"{ring[name]:.1f}") for name in names]
-        table("A ring of 30 s, 640x512 at 100 Hz", ("", "value"), rows)
+        rows = [{"name": name.replace("_", " "), "value": figures["soak_ring"][name]} for name in names]
+        print_rows("A ring of 30 s, 640x512 at 100 Hz", rows, {"": "{name}", "value": "{value:.1f}"})
         return
-    if "equal" in figures:
-        store_equal.show(figures["equal"])
-        return
-    if "splits" in figures:
-        show_splits(figures["splits"])
-        return
-    if "kills" in figures:
-        show_kills(figures["kills"])
-        return
+    for key, shown in {"equal": store_equal.show, "splits": show_splits, "kills": show_kills}.items():
+        if key in figures:
+            shown(figures[key])
+            return
     for load in figures["throughput"]:
         best = load["rows"][load["rival"]]["messages_s"]
-        table(
+        print_rows(
             f"{load['load']}: {load['messages']} messages of {load['nbytes'] / 1e3:.1f} kB",
-            ("writer", "messages/s", "MB/s", "of foxglove-sdk", "CPU ms", "ratio"),
-            [
-                (
-                    name,
-                    f"{row['messages_s']:.0f}",
-                    f"{row['mb_s']:.0f}",
-                    f"{row['messages_s'] / best:.2f}",
-                    f"{row['cpu_ms_per_message']:.3f}",
-                    f"{row['ratio']:.2f}",
-                )
-                for name, row in load["rows"].items()
-            ],
+            [{"writer": name, "of": row["messages_s"] / best, **row} for name, row in load["rows"].items()],
+            {
+                "writer": "{writer}",
+                "messages/s": "{messages_s:.0f}",
+                "MB/s": "{mb_s:.0f}",
+                "of foxglove-sdk": "{of:.2f}",
+                "CPU ms": "{cpu_ms_per_message:.3f}",
+                "ratio": "{ratio:.2f}",
+            },
         )
     loop = figures["stall"]
     priority = "real-time" if loop["loop_in_real_time"] else "ordinary"
-    table(
+    off_ms = loop["rows"]["off"]["p99_ms"]
+    print_rows(
         f"Control step, 2448x2048 at 60 Hz, {loop['ticks']} steps each, {priority} priority; "
         f"disk {figures['disk_mb_s']:.0f} MB/s",
-        ("recording", "p50 ms", "p99 ms", "max ms", "p99 of off", "dropped", "queue MB", "CPU ms per frame"),
-        [
-            (
-                name,
-                f"{row['p50_ms']:.2f}",
-                f"{row['p99_ms']:.2f}",
-                f"{row['max_ms']:.1f}",
-                f"{row['p99_ms'] / loop['rows']['off']['p99_ms']:.2f}",
-                str(row["dropped"]),
-                f"{row['queue_mb']:.0f}",
-                f"{row['cpu_ms_per_frame']:.1f}",
-            )
-            for name, row in loop["rows"].items()
-        ],
+        [{"recording": name, "of_off": row["p99_ms"] / off_ms, **row} for name, row in loop["rows"].items()],
+        {
+            "recording": "{recording}",
+            "p50 ms": "{p50_ms:.2f}",
+            "p99 ms": "{p99_ms:.2f}",
+            "max ms": "{max_ms:.1f}",
+            "p99 of off": "{of_off:.2f}",
+            "dropped": "{dropped}",
+            "queue MB": "{queue_mb:.0f}",
+            "CPU ms per frame": "{cpu_ms_per_frame:.1f}",
+        },
     )
     read = figures["reading"]
-    table(
+    print_rows(
         f"Reading {read['mb']:.0f} MB, {read['ticks']} ticks with 640x512 images",
-        ("", "ms"),
-        [
-            (name.removesuffix("_s").replace("_", " "), f"{1e3 * read[name]:.1f}")
-            for name in read
-            if name.endswith("_s")
-        ],
+        [{"what": name[:-2].replace("_", " "), "ms": 1e3 * read[name]} for name in read if name.endswith("_s")],
+        {"": "{what}", "ms": "{ms:.1f}"},
     )
-    table(
+    print_rows(
         "Whole images and windows around the robot, one image whole every 10 s",
-        ("camera", "encoding", "region", "MB per minute", "cores"),
-        [
-            (row["camera"], row["encoding"], row["region"], f"{row['mb_per_minute']:.0f}", f"{row['cores']:.2f}")
-            for row in figures["regions"]
-        ],
+        figures["regions"],
+        {
+            "camera": "{camera}",
+            "encoding": "{encoding}",
+            "region": "{region}",
+            "MB per minute": "{mb_per_minute:.0f}",
+            "cores": "{cores:.2f}",
+        },
     )
 
 

@@ -7,7 +7,6 @@ camera's rate: how late a thread wakes that sleeps 1 ms at a time, while another
 
 from __future__ import annotations
 
-import inspect
 import sys
 import tempfile
 import threading
@@ -18,37 +17,33 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import foxglove
 import mcap.writer
 import numpy as np
 import zstandard
-from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+from foxglove.mcap import MCAPCompression
 
+from flowrec.bench.harness import print_rows
 from flowrec.core.declarations import Message, message_fields
 from flowrec.core.messages import FlowField, Track
 from flowrec.core.system.processes import realtime_priority
-from flowrec.core.terminal import progress, table
-from flowrec.core.topics import BY_FIELD
+from flowrec.core.terminal import progress
 from flowrec.run.loop import SWITCH_S
-from flowrec.store import chunk, codec, mcap_writer
-from flowrec.store.channels import SLOTS, declarations, message_codec
-from flowrec.store.chunk import ChunkBuilder
-from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.channels import message_codec
 from flowrec.store.schema import Schema
-from tests.perf.store_writers import frames_given, poses_given
+from tests.perf.store_writers import (
+    CHUNK_BYTES,
+    Open,
+    Start,
+    foxglove_file,
+    frames_given,
+    mcap_file,
+    own_file,
+    poses_given,
+)
 from tests.store.made_up import encode
 
-_CHUNK_BYTES = 1 << 20
 _STEP_NS = 1_000_000
 _PERIOD_S = 1e-3
-
-
-class Open(NamedTuple):
-    """A file that is being written: `put` takes a payload and its stamp in ns."""
-
-    put: Callable[[bytes, int], None]
-    close: Callable[[], None]
 
 
 class Load(NamedTuple):
@@ -62,86 +57,29 @@ class Load(NamedTuple):
     rate_hz: float
 
 
-def _ours(path: Path, load: Load) -> Open:
-    file, builder = McapWriter(path), ChunkBuilder()
-    file.start("flowrec", "bench")
-    for record in declarations(ENCODINGS["zstd"]):
-        file.add(record)
-    number, channel = 0, SLOTS[BY_FIELD[load.field].path].channel
-
-    def put(payload: bytes, now_ns: int) -> None:
-        nonlocal number
-        builder.add(channel, number, now_ns, now_ns, (payload,))
-        number += 1
-        if builder.size >= _CHUNK_BYTES:
-            file.add_chunks([builder.seal()])
-
-    def close() -> None:
-        if builder.size:
-            file.add_chunks([builder.seal()])
-        file.finish()
-        file.close()
-
-    return Open(put, close)
-
-
-def _foxglove(path: Path, load: Load, packed_before: bool = False) -> Open:
-    options = MCAPWriteOptions(
-        compression=None if packed_before else MCAPCompression.Zstd,
-        compression_level=1,
-        compression_threads=0,
-        chunk_size=_CHUNK_BYTES,
-    )
-    context = foxglove.Context()
-    writer = foxglove.open_mcap(path, context=context, writer_options=options)
-    schema = foxglove.Schema(name=load.schema.name, encoding="protobuf", data=load.schema.data)
-    channel = foxglove.Channel("/x", message_encoding="protobuf", schema=schema, context=context)
-    compressor = zstandard.ZstdCompressor(level=1)
-
-    def put(payload: bytes, now_ns: int) -> None:
-        channel.log(compressor.compress(payload) if packed_before else payload, log_time=now_ns)
-
-    def close() -> None:
-        writer.close()
-        _ = context  # the channel lives as long as this
-
-    return Open(put, close)
-
-
-def _mcap(path: Path, load: Load) -> Open:
+def _mcap(path: Path, field: str, schema: Schema) -> Open:
     # mcap packs at level 3 and has no setting for it.
     vars(mcap.writer)["zstandard"] = SimpleNamespace(compress=partial(zstandard.compress, level=1))
-    stream = path.open("wb")
-    writer = mcap.writer.Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
-    writer.start()
-    number = writer.register_schema(load.schema.name, "protobuf", load.schema.data)
-    channel = writer.register_channel("/x", "protobuf", number)
-
-    def put(payload: bytes, now_ns: int) -> None:
-        writer.add_message(channel, now_ns, payload, now_ns)
+    file = mcap_file(path, field, schema, enable_data_crcs=True)
 
     def close() -> None:
-        writer.finish()  # type: ignore[no-untyped-call]
-        stream.close()
+        file.close()
         vars(mcap.writer)["zstandard"] = zstandard
 
-    return Open(put, close)
+    return Open(file.put, close)
 
 
-# The last one writes files that only flowrec could read: it shows what foxglove-sdk costs without its compression.
-WRITERS: dict[str, Callable[[Path, Load], Open]] = {
-    "flowrec": _ours,
-    "foxglove-sdk": _foxglove,
+WRITERS: dict[str, Start] = {
+    "flowrec": own_file,
+    "foxglove-sdk": partial(
+        foxglove_file,
+        compression=MCAPCompression.Zstd,
+        compression_level=1,
+        compression_threads=0,
+        chunk_size=CHUNK_BYTES,
+    ),
     "mcap": _mcap,
-    "foxglove-sdk, payloads packed by zstandard": partial(_foxglove, packed_before=True),
 }
-
-
-def lines_of(name: str) -> int:
-    """Lines of flowrec's own code in a writer or encoder, with those of this measurement that replace it."""
-    own = {"flowrec": (chunk, mcap_writer, _ours), "mcap": (_mcap,), "protobuf, ours": (codec,)}
-    fallback = protobuf_encoder if name.startswith("protobuf") else _foxglove
-    return sum(len(inspect.getsource(part).splitlines()) for part in own.get(name, (fallback,)))
 
 
 def protobuf_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
@@ -240,7 +178,7 @@ def measure(rounds: int = 3, share: float = 1.0, stall_s: float = 3.0) -> list[d
                 rows.setdefault((what, name), []).append(found)
                 done(turn * (len(jobs) + 1) + number + 2)
     return [
-        {"load": what, "name": name, "nbytes": sizes.get(what, 0), "lines": lines_of(name) if name else 0}
+        {"load": what, "name": name, "nbytes": sizes.get(what, 0)}
         | {key: [float(np.min(column)), float(np.median(column))] for key in found[0] for column in [_of(found, key)]}
         for (what, name), found in rows.items()
     ]
@@ -251,7 +189,7 @@ def _of(rounds: list[dict[str, float]], key: str) -> list[float]:
 
 
 def _writing(load: Load, name: str, path: Path) -> tuple[Callable[[int], Any], Callable[[], Any]]:
-    file = WRITERS[name](path, load)
+    file = WRITERS[name](path, load.field, load.schema)
     payloads = load.payloads
     return lambda number: file.put(payloads[number % len(payloads)], 10**9 + number * _STEP_NS), file.close
 
@@ -310,18 +248,17 @@ def _stall_ms(put: Callable[[int], Any], rate_hz: float, duration_s: float) -> d
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Print the medians of the rounds."""
-    table(
+    print_rows(
         "At equal terms: same bytes or messages in, chunks of 1 MiB, zstd level 1; median of the rounds",
-        ("load", "by", "us each", "MB/s", "CPU us each", "late p50 ms", "p99", "max", "lines"),
-        [
-            (
-                row["load"],
-                row["name"],
-                *((f"{row['us'][1]:.1f}", f"{row['nbytes'] / row['us'][1]:.0f}") if "us" in row else ("", "")),
-                f"{row['cpu_us'][1]:.1f}" if "us" in row else "",
-                *(f"{row[key][1]:.2f}" for key in ("p50_ms", "p99_ms", "max_ms")),
-                str(row["lines"] or ""),
-            )
-            for row in rows
-        ],
+        [{"us": None, "cpu_us": None} | row | {"mb_s": "us" in row and row["nbytes"] / row["us"][1]} for row in rows],
+        {
+            "load": "{load}",
+            "by": "{name}",
+            "us each": "{us[1]:.1f}",
+            "MB/s": "{mb_s:.0f}",
+            "CPU us each": "{cpu_us[1]:.1f}",
+            "late p50 ms": "{p50_ms[1]:.2f}",
+            "p99": "{p99_ms[1]:.2f}",
+            "max": "{max_ms[1]:.2f}",
+        },
     )

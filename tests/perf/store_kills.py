@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from flowrec.bench.harness import print_rows
 from flowrec.core.declarations import Image
 from flowrec.core.errors import SessionError
 from flowrec.core.messages import OperatorEvent
-from flowrec.core.terminal import progress, table
+from flowrec.core.terminal import progress
 from flowrec.core.topics import Tick
 from flowrec.core.units import seconds
 from flowrec.store.reader import SessionReader
@@ -113,25 +114,23 @@ def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[
 
 def show(found: dict[str, Any]) -> None:
     """Print the table."""
-
-    def worst(row: dict[str, Any], what: str) -> str:
-        lost = row[f"{what}_lost_s"]
-        return f"{lost['median']:.2f}, {lost['max']:.2f} / {row[f'{what}_stated_s']:g}"
-
-    table(
+    lost = "{{{0}_lost_s[median]:.2f}}, {{{0}_lost_s[max]:.2f}} / {{{0}_stated_s:g}}"
+    print_rows(
         "kill -9, lost in s of stamps: median, worst / stated",
-        ("", "kills", "files", "before the first flush", "broken", "late", "state", "images"),
         [
-            (
-                name,
-                *(str(row[key]) for key in ("kills", "files", "before_the_first_flush")),
-                str(len(row["faults"])),
-                str(len(row["late"])),
-                worst(row, "state"),
-                worst(row, "images"),
-            )
+            {"name": name, **row, "broken": len(row["faults"]), "late": len(row["late"])}
             for name, row in found["kinds"].items()
         ],
+        {
+            "": "{name}",
+            "kills": "{kills}",
+            "files": "{files}",
+            "before the first flush": "{before_the_first_flush}",
+            "broken": "{broken}",
+            "late": "{late}",
+            "state": lost.format("state"),
+            "images": lost.format("images"),
+        },
     )
 
 
@@ -215,11 +214,7 @@ def _row(kind: Kind, found: _Found) -> dict[str, Any]:
 def _spread(lost_s: list[float]) -> dict[str, float]:
     if not lost_s:
         return dict.fromkeys(("median", "p99", "max"), float("nan"))
-    return {
-        "median": float(np.median(lost_s)),
-        "p99": float(np.percentile(lost_s, 99)),
-        "max": max(lost_s),
-    }
+    return {"median": float(np.median(lost_s)), "p99": float(np.percentile(lost_s, 99)), "max": max(lost_s)}
 
 
 def _record(kind: Kind, path: Path, images: list[Image], handed: mmap.mmap) -> None:

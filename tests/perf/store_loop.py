@@ -1,21 +1,15 @@
-"""Cost of recording for the control loop, and memory of a long recording; two minimal rivals of the writer."""
+"""Cost of recording for the control loop, and memory of a long recording."""
 
 from __future__ import annotations
 
-import queue
 import tempfile
-import threading
 import time
-import zlib
 from dataclasses import dataclass, field, replace
 from functools import partial
-from multiprocessing import get_context
-from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zstandard
 
 from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
 from flowrec.core.declarations import Image
@@ -36,7 +30,6 @@ _RING = 140  # images, more than the queue holds
 _IN_A_THREAD = "raw, in a thread"
 _SOAK_RATE_HZ = 100.0
 _RING_S = 30.0
-_SLOTS = 16  # images in shared memory
 _WARM_S = 5.0  # until the queue, the pools and the caches have their size
 
 
@@ -64,7 +57,7 @@ class LargeCamera:
 
 
 def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
-    """The control step at 60 Hz with recording off and on, and with the rivals, which take turns.
+    """The control step at 60 Hz with recording off and on, which take turns.
 
     With the priority that `record --realtime` gives the loop. The step is what the loop times: tracking, observing,
     control, and the hand-over to the sinks of the tick before.
@@ -73,7 +66,7 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
     prepared = prepare_inputs(config, pipeline, round(duration_s * RATE_HZ))
     images = pictures(_WIDTH, _HEIGHT)
     ring = [np.ones_like(images[0]) for _ in range(_RING)]
-    kinds = ("off", "zstd", "delta", "raw", _IN_A_THREAD, "a bare thread", "a bare process")
+    kinds = ("off", "zstd", "delta", "raw", _IN_A_THREAD)
     rows: dict[str, list[Any]] = {kind: [] for kind in kinds}
     path = folder / "stall.mcap"
     with progress("flying", rounds * len(kinds)) as done:
@@ -96,13 +89,9 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
     }
 
 
-def _writer(kind: str, path: Path) -> SessionWriter | BareThread | BareProcess | None:
+def _writer(kind: str, path: Path) -> SessionWriter | None:
     if kind == "off":
         return None
-    if kind == "a bare thread":
-        return BareThread()
-    if kind == "a bare process":
-        return BareProcess(_WIDTH * _HEIGHT)
     frames, own = ("raw", False) if kind == _IN_A_THREAD else (kind, True)
     options = WriterOptions(frames=frames, overwrite=True, queue_limit_bytes=_QUEUE_BYTES, own_process=own)
     return SessionWriter(path, made_up_header(), options)
@@ -139,10 +128,7 @@ def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -
         path = Path(name) / "soak.mcap"
         pieces = Snapshot(_RING_S) if keeping else Split()
         options = WriterOptions(frames="delta", files=pieces, own_process=True)
-        with (
-            SessionWriter(path, made_up_header(), options) as writer,
-            progress("soaking", count) as done,
-        ):
+        with SessionWriter(path, made_up_header(), options) as writer, progress("soaking", count) as done:
             began = time.perf_counter()
             mark: OperatorEvent | None = None
             for number, tick in enumerate(ticks_of(images, count, _SOAK_RATE_HZ)):
@@ -170,70 +156,3 @@ def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -
         "lowest_mb": float(settled.min()),
         "growth_mb_per_minute": float(growth),
     }
-
-
-def _pack(compressor: zstandard.ZstdCompressor, content: memoryview) -> None:
-    packed = compressor.compress(content)
-    zlib.crc32(content)
-    zlib.crc32(packed)
-
-
-class BareThread:
-    """The least that a recorder in a thread can cost: images are compressed and discarded."""
-
-    def __init__(self) -> None:
-        self._images: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, daemon=True)
-        self._thread.start()
-
-    def write(self, tick: Tick) -> None:
-        if tick.frame is not None:
-            self._images.put(tick.frame.image)
-
-    def close(self) -> None:
-        self._images.put(None)
-        self._thread.join()
-
-    def _work(self) -> None:
-        compressor = zstandard.ZstdCompressor(level=1)
-        while (image := self._images.get()) is not None:
-            _pack(compressor, image.data)
-
-
-class BareProcess:
-    """The least that a recorder in a process can cost: one more copy of every image, and a message."""
-
-    def __init__(self, nbytes: int) -> None:
-        context = get_context("spawn")
-        self._nbytes = nbytes
-        self._memory: Any = SharedMemory(create=True, size=_SLOTS * nbytes)
-        self._slots, far = context.Pipe()
-        self._process = context.Process(target=_work_in_process, args=(self._memory.name, nbytes, far), daemon=True)
-        self._process.start()
-        self._slots.recv()  # it is there
-        self._next = 0
-
-    def write(self, tick: Tick) -> None:
-        if tick.frame is not None:
-            at = self._next * self._nbytes
-            slot = np.frombuffer(self._memory.buf, np.uint8, self._nbytes, at)
-            np.copyto(slot, tick.frame.image.reshape(-1))
-            self._slots.send(self._next)
-            self._next = (self._next + 1) % _SLOTS
-
-    def close(self) -> None:
-        self._slots.send(None)
-        self._process.join()
-        self._memory.close()
-        self._memory.unlink()
-
-
-def _work_in_process(name: str, nbytes: int, slots: Any) -> None:
-    memory: Any = SharedMemory(name)
-    compressor = zstandard.ZstdCompressor(level=1)
-    slots.send(True)
-    while (slot := slots.recv()) is not None:
-        content = memory.buf[slot * nbytes : (slot + 1) * nbytes]
-        _pack(compressor, content)
-        content.release()
-    memory.close()

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from flowrec.bench.harness import print_rows
 from flowrec.core.declarations import Image
 from flowrec.core.messages import FlowField, OperatorEvent
-from flowrec.core.terminal import progress, table
+from flowrec.core.terminal import progress
 from flowrec.core.topics import Tick
 from flowrec.run.loop import SWITCH_S
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
@@ -138,38 +139,22 @@ def _row(runs: list[dict[str, Any]], split_ticks: int) -> dict[str, float]:
 
 def show_splits(found: dict[str, Any]) -> None:
     """Print the table."""
-    rows = found["rows"]
-    base = rows["one file"]
-    table(
+    base_ms = found["rows"]["one file"]["near_max_ms"]
+    print_rows(
         f"write() at 60 Hz with 1224x1024 images, {found['ticks']} ticks each; parts of {found['split_s']:g} s, a ring "
         "of as much and a mark; near: the third of a second from where a part begins, the same ticks of the others",
-        (
-            "",
-            "p50 ms",
-            "p99 ms",
-            "max ms",
-            "near p99",
-            "near max",
-            "of one file",
-            "queue MB",
-            "dropped",
-            "files",
-            "CPU ms",
-        ),
-        [
-            (
-                kind,
-                f"{row['p50_ms']:.3f}",
-                f"{row['p99_ms']:.2f}",
-                f"{row['max_ms']:.1f}",
-                f"{row['near_p99_ms']:.2f}",
-                f"{row['near_max_ms']:.1f}",
-                f"{row['near_max_ms'] / base['near_max_ms']:.2f}",
-                f"{row['queue_mb']:.0f}",
-                str(row["dropped"]),
-                str(row["files"]),
-                f"{row['cpu_ms_per_frame']:.1f}",
-            )
-            for kind, row in rows.items()
-        ],
+        [{"kind": kind, "of_base": row["near_max_ms"] / base_ms, **row} for kind, row in found["rows"].items()],
+        {
+            "": "{kind}",
+            "p50 ms": "{p50_ms:.3f}",
+            "p99 ms": "{p99_ms:.2f}",
+            "max ms": "{max_ms:.1f}",
+            "near p99": "{near_p99_ms:.2f}",
+            "near max": "{near_max_ms:.1f}",
+            "of one file": "{of_base:.2f}",
+            "queue MB": "{queue_mb:.0f}",
+            "dropped": "{dropped}",
+            "files": "{files}",
+            "CPU ms": "{cpu_ms_per_frame:.1f}",
+        },
     )

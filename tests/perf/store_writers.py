@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import foxglove
 import numpy as np
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
@@ -21,6 +22,7 @@ from flowrec.store.channels import SLOTS, declarations, message_codec
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.schema import Schema
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.writer import SessionWriter
@@ -28,7 +30,7 @@ from tests.store.made_up import encode
 
 _NOISE = 3.0  # grey levels, one sigma: a camera's at this brightness
 _STEP_NS = 1_000_000
-_CHUNK_BYTES = 1 << 20  # as the bare writers have it
+CHUNK_BYTES = 1 << 20
 
 
 class Given(NamedTuple):
@@ -109,99 +111,104 @@ def _session(encoding: str) -> Write:
     return write
 
 
-def _file(path: Path, data: list[Given], count: int) -> None:
+class Open(NamedTuple):
+    """A file that is being written: `put` takes a payload and its stamp in ns."""
+
+    put: Callable[[bytes, int], None]
+    close: Callable[[], None]
+
+
+Start = Callable[[Path, str, Schema], Open]  # file to make, field of the tick, schema of its messages
+
+
+def own_file(path: Path, field: str, _: Schema) -> Open:
     """The MCAP file alone, without SessionWriter: bytes in, as for the other writers."""
-    slot = SLOTS[BY_FIELD[data[0].field].path]
     file, builder = McapWriter(path), ChunkBuilder()
     file.start("flowrec", "bench")
     for record in declarations(ENCODINGS["zstd"]):
         file.add(record)
-    for n in range(count):
-        now = 10**9 + n * _STEP_NS
-        builder.add(slot.channel, n, now, now, (data[n % len(data)].payload,))
-        if builder.size >= _CHUNK_BYTES:
+    numbers, channel = itertools.count(), SLOTS[BY_FIELD[field].path].channel
+
+    def put(payload: bytes, now_ns: int) -> None:
+        builder.add(channel, next(numbers), now_ns, now_ns, (payload,))
+        if builder.size >= CHUNK_BYTES:
             file.add_chunks([builder.seal()])
-    file.add_chunks([builder.seal()])
-    file.finish()
-    file.close()
+
+    def close() -> None:
+        if builder.size:
+            file.add_chunks([builder.seal()])
+        file.finish()
+        file.close()
+
+    return Open(put, close)
 
 
-def _mcap(compression: CompressionType) -> Write:
-    def write(path: Path, data: list[Given], count: int) -> None:
-        schema = message_codec(type(data[0].message)).schema
-        with path.open("wb") as stream:
-            writer = Writer(stream, compression=compression)
-            writer.start()
-            number = writer.register_schema(schema.name, "protobuf", schema.data)
-            channel = writer.register_channel("/x", "protobuf", number)
-            for n in range(count):
-                now = 10**9 + n * _STEP_NS
-                writer.add_message(channel, now, data[n % len(data)].payload, now, n)
-            writer.finish()  # type: ignore[no-untyped-call]
+def mcap_file(path: Path, _: str, schema: Schema, **options: Any) -> Open:
+    """By mcap's Writer, with these options."""
+    stream = path.open("wb")
+    writer = Writer(stream, chunk_size=CHUNK_BYTES, **options)
+    writer.start()
+    channel = writer.register_channel("/x", "protobuf", writer.register_schema(schema.name, "protobuf", schema.data))
 
-    return write
+    def close() -> None:
+        writer.finish()  # type: ignore[no-untyped-call]
+        stream.close()
+
+    return Open(lambda payload, now_ns: writer.add_message(channel, now_ns, payload, now_ns), close)
 
 
-def _foxglove(options: MCAPWriteOptions, file_of: Callable[[Given], bytes] = lambda given: given.payload) -> Write:
-    def write(path: Path, data: list[Given], count: int) -> None:
-        schema = message_codec(type(data[0].message)).schema
-        context = foxglove.Context()
-        writer = foxglove.open_mcap(path, context=context, writer_options=options)
-        described = foxglove.Schema(name=schema.name, encoding="protobuf", data=schema.data)
-        channel = foxglove.Channel("/x", message_encoding="protobuf", schema=described, context=context)
-        for n in range(count):
-            channel.log(file_of(data[n % len(data)]), log_time=10**9 + n * _STEP_NS)
+def foxglove_file(path: Path, _: str, schema: Schema, **options: Any) -> Open:
+    """By foxglove-sdk, with these options."""
+    context = foxglove.Context()
+    writer = foxglove.open_mcap(path, context=context, writer_options=MCAPWriteOptions(**options))
+    described = foxglove.Schema(name=schema.name, encoding="protobuf", data=schema.data)
+    channel = foxglove.Channel("/x", message_encoding="protobuf", schema=described, context=context)
+
+    def close() -> None:
         writer.close()
+        _ = context  # the channel lives as long as this
+
+    return Open(lambda payload, now_ns: channel.log(payload, log_time=now_ns), close)
+
+
+def _bytes(start: Start) -> Write:
+    def write(path: Path, data: list[Given], count: int) -> None:
+        file = start(path, data[0].field, message_codec(type(data[0].message)).schema)
+        for number in range(count):
+            file.put(data[number % len(data)].payload, 10**9 + number * _STEP_NS)
+        file.close()
 
     return write
 
 
-def _png(given: Given) -> bytes:
-    """PNG by cv2 with its defaults."""
-    assert isinstance(given.message, Frame)
-    return cv2.imencode(".png", given.message.image)[1].tobytes()
-
-
-_UNPACKED = MCAPWriteOptions(compression=None)
+_ZSTD = MCAPCompression.Zstd
 WRITERS: dict[str, Write] = {
     **{f"flowrec, {encoding}": _session(encoding) for encoding in ("raw", "zstd", "delta", "png", "jpeg")},
-    "flowrec, bytes": _file,
-    "mcap, zstd": _mcap(CompressionType.ZSTD),
-    "mcap, none": _mcap(CompressionType.NONE),
-    "foxglove-sdk, zstd": _foxglove(MCAPWriteOptions(compression=MCAPCompression.Zstd)),
-    "foxglove-sdk, zstd 1": _foxglove(MCAPWriteOptions(compression=MCAPCompression.Zstd, compression_level=1)),
-    "foxglove-sdk, none": _foxglove(_UNPACKED),
-    "foxglove-sdk, png": _foxglove(_UNPACKED, _png),
+    "flowrec, bytes": _bytes(own_file),
+    "mcap, zstd": _bytes(partial(mcap_file, compression=CompressionType.ZSTD)),
+    "mcap, none": _bytes(partial(mcap_file, compression=CompressionType.NONE)),
+    "foxglove-sdk, zstd": _bytes(partial(foxglove_file, compression=_ZSTD)),
+    "foxglove-sdk, zstd 1": _bytes(partial(foxglove_file, compression=_ZSTD, compression_level=1)),
+    "foxglove-sdk, none": _bytes(partial(foxglove_file, compression=None)),
 }
 
 _RIVAL = "foxglove-sdk, zstd 1"  # at our level
 _RIVALS = ("foxglove-sdk, zstd", _RIVAL, "foxglove-sdk, none")
+_SIZES = ("flowrec, zstd", "flowrec, delta")
 LOADS = (
-    Load(
-        "1 kB poses",
-        60_000,
-        poses_given,
-        ("flowrec, zstd", "flowrec, bytes", "mcap, zstd", *_RIVALS),
-        _RIVAL,
-    ),
+    Load("1 kB poses", 60_000, poses_given, ("flowrec, zstd", "flowrec, bytes", "mcap, zstd", *_RIVALS), _RIVAL),
     Load(
         "640x512",
         400,
-        lambda: frames_given(640, 512),
-        (
-            *("flowrec, delta", "flowrec, zstd", "flowrec, png", "flowrec, jpeg"),
-            *("mcap, zstd", "foxglove-sdk, png", *_RIVALS),
-        ),
+        partial(frames_given, 640, 512),
+        (*_SIZES, "flowrec, png", "flowrec, jpeg", "mcap, zstd", *_RIVALS),
         _RIVAL,
     ),
     Load(
         "2448x2048",
         80,
-        lambda: frames_given(2448, 2048),
-        (
-            *("flowrec, zstd", "flowrec, delta", "flowrec, raw"),
-            *("mcap, zstd", "mcap, none", *_RIVALS),
-        ),
+        partial(frames_given, 2448, 2048),
+        (*_SIZES, "flowrec, raw", "mcap, zstd", "mcap, none", *_RIVALS),
         _RIVAL,
     ),
 )

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import zstandard
 from mcap.reader import make_reader
 
 from flowrec.store.channels import message_codec
@@ -40,7 +39,7 @@ def test_at_equal_terms_every_writer_packs_the_same_bytes_as_well(tmp_path):
     sizes = []
     for number, name in enumerate(store_equal.WRITERS):
         path = tmp_path / f"{number}.mcap"
-        file = store_equal.WRITERS[name](path, load)
+        file = store_equal.WRITERS[name](path, load.field, load.schema)
         for stamp_ns, payload in enumerate(load.payloads, 1):
             file.put(payload, stamp_ns)
         file.close()
@@ -48,8 +47,6 @@ def test_at_equal_terms_every_writer_packs_the_same_bytes_as_well(tmp_path):
             reader = make_reader(stream, validate_crcs=True)
             stored = [message.data for _, _, message in reader.iter_messages()]
             schemas = sum(len(schema.data) for schema in reader.get_summary().schemas.values())
-        if "packed" in name:
-            stored = [zstandard.decompress(data) for data in stored]
         assert stored == load.payloads, name
         sizes.append(path.stat().st_size - 2 * schemas)  # among the messages and in the summary
     assert np.ptp(sizes) < 0.03 * sizes[0]

@@ -21,9 +21,8 @@ import typer
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from flowrec.bench.harness import Results, run
+from flowrec.bench.harness import Results, print_rows, run
 from flowrec.core.messages import Frame, Tracers
-from flowrec.core.terminal import table
 from flowrec.core.units import nanoseconds
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.registration import Calibration
@@ -200,25 +199,22 @@ def measure(
 
 def show(found: dict[str, Any]) -> None:
     """Print the figures."""
-    columns = ("images", "method", "found", "false", "error", "switches per 1000", "CPU a frame")
-    table(
+    print_rows(
         "Tracks of tracers",
-        columns,
-        [
-            (
-                row["images"],
-                row["method"],
-                f"{row['found']:.1%}",
-                f"{row['false']:.1%}",
-                f"{row['rms_px']:.2f} px",
-                f"{row['switches_per_1000']:.1f}",
-                f"{row['ms']:.1f} ms",
-            )
-            for row in found["rows"]
-        ],
+        found["rows"],
+        {
+            "images": "{images}",
+            "method": "{method}",
+            "found": "{found:.1%}",
+            "false": "{false:.1%}",
+            "error": "{rms_px:.2f} px",
+            "switches per 1000": "{switches_per_1000:.1f}",
+            "CPU a frame": "{ms:.1f} ms",
+        },
     )
-    if found["openpiv"]:
-        table("Beside OpenPIV", ("", "value"), [(key, f"{value:.3g}") for key, value in found["openpiv"].items()])
+    rows = [{"what": key, "value": value} for key, value in found["openpiv"].items()]
+    if rows:
+        print_rows("Beside OpenPIV", rows, {"": "{what}", "value": "{value:.3g}"})
 
 
 if __name__ == "__main__":

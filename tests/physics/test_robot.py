@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flowrec.core.errors import UsageError
 from flowrec.core.messages import Applied
@@ -11,8 +10,8 @@ from flowrec.physics.robot import Robot
 from flowrec.stages.config import load_config
 from flowrec.stages.resolve import resolve
 from flowrec.store.reader import SessionReader
-from flowrec.verbs.cli import app
 from flowrec.verbs.record import record
+from tests.conftest import invoke
 from tests.short_missions import SMALL
 
 # Speed per revolution falls from 30 to 14 um: of a helix near its step-out, or a roller that slips.
@@ -84,7 +83,7 @@ def test_a_roller_a_helix_and_a_robot_by_a_table_reach_their_goal_and_replay_ide
     reader = SessionReader(done.path)
     assert list(reader.messages("mission"))[-1].outcome == "reached"
     assert list(reader.messages("truth"))[-1].contacts == 0
-    verdict = CliRunner().invoke(app, ["replay", str(done.path), "--verify"])
+    verdict = invoke("replay", done.path, "--verify")
     assert verdict.exit_code == 0 and "every tick identical" in verdict.stdout + verdict.stderr
     if sets != [table_of(TABLE)]:
         return

@@ -253,9 +253,7 @@ def test_people_are_told_who_steers_why_it_ended_and_what_goes_on(steered: tuple
     assert "held by the operator" not in text
 
 
-def test_a_replay_has_the_same_commands_by_the_recorded_samples_from_any_tick(
-    steered: tuple[Path, list[Tick]],
-) -> None:
+def test_a_replay_has_the_same_commands_by_the_recorded_samples_from_any_tick(steered: tuple[Path, list[Tick]]) -> None:
     path, _ = steered
     assert replay_session(path, verify=True).identical
     for from_s in (1.2, 1.6, 3.0):

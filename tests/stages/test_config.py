@@ -153,8 +153,7 @@ def last_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int
 
 
 @pytest.mark.parametrize(
-    "swift",
-    [["chip.inlet_speed_um_s=60000"], ["robot.max_speed_um_s=600", "chip.inlet_speed_um_s=3000"]],
+    "swift", [["chip.inlet_speed_um_s=60000"], ["robot.max_speed_um_s=600", "chip.inlet_speed_um_s=3000"]]
 )
 def test_a_goal_that_is_found_unreachable_before_the_run_fails_as_one_found_during_it(
     swift: list[str], capsys: pytest.CaptureFixture[str]

@@ -222,11 +222,7 @@ def listing_of(opcode: int, body: bytes, offset: int) -> list[tuple[int, bytes]]
 
 
 def _append_piece(
-    file: bytearray,
-    listed: list[tuple[int, bytes]],
-    counts: dict[int, int],
-    span: list[int],
-    piece: Piece,
+    file: bytearray, listed: list[tuple[int, bytes]], counts: dict[int, int], span: list[int], piece: Piece
 ) -> None:
     content = bytearray()
     indexes: dict[int, bytes] = {}

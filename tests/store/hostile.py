@@ -11,10 +11,7 @@ from flowrec.store.channels import SLOTS
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session_path import session_path
-from tests.store.drafts import (
-    small_draft,
-    text,
-)
+from tests.store.drafts import small_draft, text
 from tests.store.range_server import served
 
 _CHUNK_OPCODE = 6

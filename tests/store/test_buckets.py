@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.archive.sweep.tasks import content_of, session_files
@@ -18,8 +17,8 @@ from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import part_path
 from flowrec.store.session import Session
 from flowrec.store.session_path import session_path
-from flowrec.verbs.cli import app
 from flowrec.verbs.ls import ls
+from tests.conftest import invoke
 from tests.store.range_server import served
 from tests.store.s3_server import BUCKET, KEYS, S3Server, s3_server
 from tests.store.test_run_files import in_parts
@@ -103,8 +102,8 @@ def test_a_replay_and_an_export_of_a_run_in_parts_in_a_bucket(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     url = f"s3://{BUCKET}/runs/x.mcap"
-    done = CliRunner().invoke(app, ["replay", url, "--verify", "--json"])
-    near = CliRunner().invoke(app, ["replay", str(run), "--verify", "--json"])
+    done = invoke("replay", url, "--verify", "--json")
+    near = invoke("replay", run, "--verify", "--json")
     assert (done.exit_code, {**json.loads(done.stdout), "session": ""}) == (
         near.exit_code,
         {**json.loads(near.stdout), "session": ""},
@@ -144,6 +143,6 @@ def test_a_folder_and_a_pattern_in_a_bucket_are_listed_and_swept(bucket: S3Serve
 
 def test_the_notes_of_a_session_in_a_bucket_are_printed_and_none_is_added(bucket: S3Server) -> None:
     url = f"s3://{BUCKET}/runs/x.mcap"
-    assert "#bubble bubble at the outlet" in CliRunner().invoke(app, ["note", url]).stdout
+    assert "#bubble bubble at the outlet" in invoke("note", url).stdout
     with pytest.raises(UsageError, match="no note is added to a session at a URL; copy it to this machine"):
         Session(url).add_note("seen")

@@ -146,11 +146,7 @@ def test_half_a_character_is_spelled_out_instead_of_ending_the_run():
 
 def test_a_value_that_can_not_be_stored_is_told_with_type_and_stamp():
     flat = Track(7, True, np.zeros((2, 2)), 1.0, 0, 1.0, np.zeros(4))
-    for message in (
-        flat,
-        Frame(7, -1, np.zeros((2, 2), np.uint8)),
-        dataclasses.replace(flat, score=None),
-    ):
+    for message in (flat, Frame(7, -1, np.zeros((2, 2), np.uint8)), dataclasses.replace(flat, score=None)):
         with pytest.raises(SessionError, match=f"a {type(message).__name__} at 7 ns can not be stored"):
             encode(message)
 

@@ -10,7 +10,6 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flowrec.core.declarations import Message, as_read, invalid_numbers, message_fields, shape_error
 from flowrec.core.errors import SessionError, UsageError, printable
@@ -24,16 +23,8 @@ from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.check import check
-from flowrec.verbs.cli import app
-from tests.store.drafts import (
-    ATTACHMENT,
-    CHANNEL,
-    METADATA,
-    PERIOD_NS,
-    TICKS,
-    made_up,
-    text,
-)
+from tests.conftest import invoke
+from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, text
 from tests.store.hostile import (
     DRAFT,
     FRAMES,
@@ -176,7 +167,7 @@ def spoiled(session, tmp_path, field, **changes):
 def test_numbers_that_can_not_be_are_named_where_a_verb_fails_over_them(session, tmp_path, verb, field, changes, done):
     path = spoiled(session, tmp_path, field, **changes)
     words = ["replay", str(path), "--verify"] if verb == "replay" else ["export", str(path)]
-    error = CliRunner().invoke(app, words).exception
+    error = invoke(*words).exception
     assert isinstance(error, SessionError), error
     (name,) = changes
     told = rf"{BY_FIELD[field].path} {name} at \d\.\d+ s holds NaN, infinity or an impossibly large number, .* {done}"
@@ -190,7 +181,7 @@ def test_text_in_a_file_can_not_steer_a_terminal(tmp_path):
     outcome = text("flowrec.outcome") + packed_map({"outcome": HARMFUL, "note": HARMFUL, "route": HARMFUL})
     path = file_of(tmp_path, replace(DRAFT, tail=((METADATA, outcome),)))
     for words in (["info", path], ["ls", tmp_path], ["check", path]):
-        shown = CliRunner().invoke(app, [*map(str, words)]).output
+        shown = invoke(*words).output
         assert "owned" in shown or "\\x1b" in shown
         assert not set(shown) & set("\x1b\x07\r\u202e\x9b")
     channel = struct.pack("<HH", 900, 777) + text(HARMFUL) + text("protobuf") + bytes(4)
@@ -213,7 +204,7 @@ def test_a_text_that_would_become_gigabytes_of_tables_is_not_parsed(tmp_path, to
             parse()
         assert len(str(error.value)) < 200
     (tmp_path / "a.toml").write_text(toml)
-    done = CliRunner().invoke(app, ["record", "--dry-run", str(tmp_path / "a.toml")])
+    done = invoke("record", "--dry-run", tmp_path / "a.toml")
     assert isinstance(done.exception, UsageError) and said in str(done.exception)
 
 

@@ -12,23 +12,13 @@ from dataclasses import replace
 import pytest
 import zstandard
 from mcap.records import Schema
-from typer.testing import CliRunner
 
 from flowrec.core.errors import SessionError
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.verbs.check import check
-from flowrec.verbs.cli import app
-from tests.store.drafts import (
-    CHANNEL,
-    CHUNK_INDEX,
-    MESSAGE,
-    METADATA,
-    SCHEMA,
-    TICKS,
-    record,
-    text,
-)
+from tests.conftest import invoke
+from tests.store.drafts import CHANNEL, CHUNK_INDEX, MESSAGE, METADATA, SCHEMA, TICKS, record, text
 from tests.store.hostile import (
     _CHUNK_OPCODE,
     DRAFT,
@@ -72,8 +62,7 @@ def test_a_million_empty_messages_are_not_made(tmp_path):
     tiny = record(MESSAGE, struct.pack("<HIQQ", STATE, 0, 10**9, 10**9)) * 140_000
     packed = zstandard.compress(tiny)
     path = file_of(
-        tmp_path,
-        with_piece(STATE, lambda p: replace(p, packed=packed, told_size=len(tiny), told_crc=zlib.crc32(tiny))),
+        tmp_path, with_piece(STATE, lambda p: replace(p, packed=packed, told_size=len(tiny), told_crc=zlib.crc32(tiny)))
     )
     refused(path, "more than 131072 messages in one chunk")
 
@@ -164,7 +153,7 @@ def with_session(**said):
 def test_a_version_of_thousands_of_digits_is_cut_and_does_not_hide_the_other_sessions(tmp_path):
     path = file_of(tmp_path, with_session(format_version="9" * 5000, flowrec_version="8" * 5000))
     refused(path, "is a session of format '9999.*install flowrec 8888")
-    done = CliRunner().invoke(app, ["ls", str(tmp_path), "--json"])
+    done = invoke("ls", tmp_path, "--json")
     assert done.exit_code == 0 and len(done.stdout) < 1000 and "of format" in done.stdout
 
 

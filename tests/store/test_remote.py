@@ -15,7 +15,6 @@ from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core.errors import FlowrecError, SessionError, UsageError
@@ -25,8 +24,7 @@ from flowrec.store.object_requests import _redirect_target
 from flowrec.store.run_files import session_sha256
 from flowrec.store.session_path import UrlPath, session_path
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError, ask_repeatedly
-from flowrec.verbs.cli import app
-from tests.conftest import HANG_S, run
+from tests.conftest import HANG_S, invoke, run
 from tests.extras import needs
 from tests.store.range_server import Fault, RangeServer, answer, served, some, status
 from tests.store.s3_server import BUCKET, KEYS, s3_server
@@ -243,7 +241,7 @@ def test_outputs_of_a_session_at_a_url_are_made_in_this_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert flowrec.export(server.url, file_format="csv") == Path(f"{session.stem}_csv")
-    done = CliRunner().invoke(app, ["replay", server.url, "--set", "plan.speed_share=0.7"])  # a Path of the URL
+    done = invoke("replay", server.url, "--set", "plan.speed_share=0.7")  # a Path of the URL
     assert done.exit_code == 0, done.output
     assert flowrec.open(f"{session.stem}_replay_001.mcap").header.parent["file"] == session.name
     with pytest.raises(UsageError, match="no note is added to a session at a URL"):

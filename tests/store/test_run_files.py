@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from flowrec.core.errors import SessionError
 from flowrec.core.topics import BY_FIELD, Tick
@@ -25,12 +24,12 @@ from flowrec.store.session_writer import session_header
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.check import check
-from flowrec.verbs.cli import app
 from flowrec.verbs.compare import compare
 from flowrec.verbs.info import info
 from flowrec.verbs.ls import ls
 from flowrec.verbs.record import record
 from flowrec.verbs.replay_change import Change
+from tests.conftest import typed
 from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of
 
@@ -323,7 +322,7 @@ def test_a_stretch_of_a_survey_that_was_ordered_before_a_part_begins_is_taken_as
 def test_recover_and_export_answer_in_json(run, rrd_only_begun):
     partial = partial_path(part_path(run, 4))
     part_path(run, 4).rename(partial)
-    done = CliRunner().invoke(app, ["recover", str(run), "--json"], catch_exceptions=False)
+    done = typed("recover", run, "--json")
     (told,) = json.loads(done.stdout)
     assert told["path"].endswith("x.part004.mcap") and told["ticks"] == 20 and done.exit_code == 0
 

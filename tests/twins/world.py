@@ -24,9 +24,7 @@ ImageFileMode\tOn
 class EmulatedView:
     """Where pylon's emulator finds the latest image.
 
-    Attributes
-    ----------
-    sets : settings of a recorder.
+    `sets`: settings of a recorder.
     """
 
     def __init__(self, folder: Path, config: ResolvedConfig) -> None:

@@ -5,7 +5,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flowrec.core.errors import ChipError, FlowrecError, UsageError
 from flowrec.core.system.outputs import OutputError
@@ -16,7 +15,7 @@ from flowrec.physics.chip.io import load_chip
 from flowrec.physics.chip.registration import Calibration
 from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.verbs.cli import app
+from tests.conftest import invoke
 from tests.physics.chip.looks import LOOKS, picture
 
 CHIP = load_chip(ChipSettings("bifurcation"))
@@ -38,7 +37,7 @@ def test_the_flow_on_the_chip_of_a_picture_is_about_that_on_the_true_one(image, 
     out = tmp_path / "mine.toml"
     words = ["calibrate", "chip", str(image), "--um-per-px", str(UM_PER_PX), "-o", str(out)]
     words += ["--inlet", "left:0", "--inlet-speed", "220"]
-    done = CliRunner().invoke(app, words)
+    done = invoke(*words)
     assert done.exit_code == 0, done.output
     assert {path.name for path in tmp_path.iterdir()} == {"mine.toml", "mine.png", "mine_overlay.png"}
     chip = load_chip(ChipSettings(path=str(out)))
@@ -49,7 +48,7 @@ def test_the_flow_on_the_chip_of_a_picture_is_about_that_on_the_true_one(image, 
     shift_um = (np.array(chip.size_um) - chip.um_per_px - np.array(CHIP.size_um) + 20.0) / 2
     off = sample(found, at_um + shift_um) - sample(true, at_um)
     assert np.sqrt(np.sum(off**2) / np.sum(sample(true, at_um) ** 2)) < 0.07
-    assert isinstance(CliRunner().invoke(app, words).exception, OutputError)  # nothing is overwritten
+    assert isinstance(invoke(*words).exception, OutputError)  # nothing is overwritten
 
 
 def test_what_a_picture_does_not_tell_is_asked_for_and_a_corrected_mask_loads(image, tmp_path):

@@ -12,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core.errors import UsageError
@@ -20,8 +19,8 @@ from flowrec.measure.calibrate_image import fragment, registration_state
 from flowrec.physics.chip.registration import Calibration
 from flowrec.stages.config import load_config, with_sets
 from flowrec.stages.rig_settings import CameraSettings
-from flowrec.verbs.cli import app
 from flowrec.verbs.record import record
+from tests.conftest import invoke
 from tests.short_missions import SMALL
 
 POSE = ("angle_deg=182", "mirror=true", "centre_um=[3340,2350]", "um_per_px=20.4")
@@ -37,9 +36,7 @@ def registration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture = next(iter(flowrec.open(record(load_config(None, sets), folder / "short.mcap").path).frames)).image
     cv2.imwrite(str(folder / "picture.png"), picture)
     words = ["calibrate", "image", str(folder / "picture.png"), "-o", str(folder / "registration.toml"), "--mirror"]
-    done = CliRunner().invoke(
-        app, [*words, *(word for each in (*CHIP, "camera.um_per_px=20") for word in ("--set", each))]
-    )
+    done = invoke(*words, *(word for each in (*CHIP, "camera.um_per_px=20") for word in ("--set", each)))
     assert done.exit_code == 0, done.output
     return folder / "registration.toml"
 
@@ -114,10 +111,10 @@ def test_several_poses_are_listed_and_nothing_is_written(tmp_path):
     picture = next(iter(flowrec.open(record(config, tmp_path / "short.mcap").path).frames)).image
     cv2.imwrite(str(tmp_path / "picture.png"), picture)
     words = ["calibrate", "image", str(tmp_path / "picture.png"), "--set", "camera.um_per_px=20"]
-    done = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "out.toml"), "--json"])
+    done = invoke(*words, "-o", tmp_path / "out.toml", "--json")
     found = json.loads(done.stdout)
     assert done.exit_code == 1 and found["chosen"] is None
     assert sorted(pose["mirror"] for pose in found["poses"]) == [False, True]
     assert not list(tmp_path.glob("out*"))
-    done = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "out.toml"), "--pick", "1"])
+    done = invoke(*words, "-o", tmp_path / "out.toml", "--pick", "1")
     assert done.exit_code == 0 and {file.name for file in tmp_path.glob("out*")} == {"out.toml", "out.png"}

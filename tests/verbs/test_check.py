@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core.diagnostics import CameraLosses
@@ -24,7 +23,7 @@ from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.check import check
-from flowrec.verbs.cli import app
+from tests.conftest import typed
 from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_run_files import in_parts
@@ -57,10 +56,6 @@ def ending(**said):
 
 def found(verdict):
     return [(finding.about, finding.text) for finding in verdict.findings]
-
-
-def typed(*words):
-    return CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
 
 
 def test_a_real_mission_is_good_and_its_verdict_comes_first(session):

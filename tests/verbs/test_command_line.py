@@ -14,12 +14,11 @@ from pathlib import Path
 
 import pytest
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from flowrec.bench import plan
 from flowrec.core import REPLAYED, terminal
 from flowrec.verbs.cli import app, with_default_refine
-from tests.conftest import run
+from tests.conftest import invoke, run
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
 
@@ -38,13 +37,13 @@ def test_a_bench_prints_its_figures_as_json_like_every_other_verb(
 
 @pytest.mark.parametrize("words", [["-h"], ["record", "-h"], ["bench", "plan", "-h"]])
 def test_help_is_asked_for_in_short(words: list[str]) -> None:
-    done = CliRunner().invoke(app, words)
+    done = invoke(*words)
     assert done.exit_code == 0
     assert "Show this message" in done.output
 
 
 def test_the_help_of_replay_and_export_names_every_method_of_every_table() -> None:
-    helps = [CliRunner().invoke(app, [verb, "--help"], env={"COLUMNS": "200"}).output for verb in ("replay", "export")]
+    helps = [invoke(verb, "--help", env={"COLUMNS": "200"}).output for verb in ("replay", "export")]
     shown = " ".join("".join(helps).split())
     for target in (*REPLAYED.values(), "flowrec.exports.formats:EXPORTS"):
         module, _, table = target.partition(":")
@@ -122,7 +121,7 @@ def test_a_shell_completes_verbs_methods_and_settings(words: str, offered: str, 
 
 
 def test_the_help_of_calibrate_coils_names_the_section_that_it_writes() -> None:
-    shown = CliRunner().invoke(app, ["calibrate", "coils", "--help"], env={"COLUMNS": "160"}).output
+    shown = invoke("calibrate", "coils", "--help", env={"COLUMNS": "160"}).output
     assert "(section coils)" in " ".join(shown.split())
 
 

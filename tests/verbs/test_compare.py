@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flowrec.core.declarations import as_read
 from flowrec.core.messages import Demand, FlowField
@@ -19,19 +18,13 @@ from flowrec.stages.config import load_config, to_toml
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import app
 from flowrec.verbs.compare import compare
 from flowrec.verbs.comparison import Comparison
+from tests.conftest import answered
 from tests.rewritten import array_of, edit_of_head, rewrite
 from tests.store.made_up import HEADER, ticks_of
 
 NAN, INF = float("nan"), float("inf")
-
-
-def run(*words: object) -> tuple[int, str]:
-    """Exit status and what was printed."""
-    done = CliRunner().invoke(app, [str(word) for word in words])
-    return done.exit_code, done.output
 
 
 def demand(pairs: list[list[float]], error_um: float = 0.0) -> Tick:
@@ -95,7 +88,7 @@ def double_time_to_go(channel: Any, _: Any, wire: Any) -> bool:
 @pytest.mark.slow("verifies a mission again")
 def test_a_session_whose_times_to_go_were_doubled_is_not_verified(session: Path, tmp_path: Path) -> None:
     assert rewrite(session, tmp_path / "doubled.mcap", double_time_to_go) == 1
-    status, said = run("replay", tmp_path / "doubled.mcap", "--verify", "--json")
+    status, said = answered("replay", tmp_path / "doubled.mcap", "--verify", "--json")
     assert status == 3
     found = json.loads(said)
     assert "NOT the same" in found["lines"][-1]
@@ -122,7 +115,7 @@ def ticks() -> list[Tick]:
 def test_images_of_another_size_are_a_difference(tmp_path: Path, ticks: list[Tick]) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     second = small_session(tmp_path / "b.mcap", list(ticks_of(20, shape=(40, 64))))
-    status, said = run("compare", first, second)
+    status, said = answered("compare", first, second)
     assert status == 3
     assert "uint8 of shape (48, 64)" in said
 
@@ -134,7 +127,7 @@ def test_one_message_that_differs_is_told_with_its_number_of_ticks(tmp_path: Pat
     here = estimate.position_um + np.array([0.0, 1.0])
     ticks[7] = replace(ticks[7], estimate=replace(estimate, position_um=here))
     second = small_session(tmp_path / "b.mcap", ticks)
-    status, said = run("compare", first, second, "--json")
+    status, said = answered("compare", first, second, "--json")
     found = json.loads(said)
     assert status == 3
     assert found["different_ticks"] == 1 and not found["same"]
@@ -147,7 +140,7 @@ def test_one_message_that_differs_is_told_with_its_number_of_ticks(tmp_path: Pat
 def test_a_tick_that_only_one_session_has_is_a_difference_of_that_tick_alone(tmp_path: Path, ticks: list[Tick]) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     second = small_session(tmp_path / "b.mcap", ticks[:9] + ticks[10:])
-    status, said = run("compare", first, second, "--json")
+    status, said = answered("compare", first, second, "--json")
     assert status == 3
     assert json.loads(said)["ticks"] == 20
     # The tick after it holds the state that the missing one would have brought, in new messages of its own.
@@ -159,11 +152,11 @@ def test_images_that_a_replay_did_not_copy_are_told_with_what_leaves_them_out(
 ) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     second = small_session(tmp_path / "b.mcap", [replace(tick, frame=None) for tick in ticks], parent=True)
-    status, said = run("compare", first, second)
+    status, said = answered("compare", first, second)
     assert status == 3
     assert "/camera/frame only in a.mcap, 20 messages" in " ".join(said.split())
     assert "--ignore parent,/camera/frame leaves them out" in said
-    status, said = run("compare", first, second, "--ignore", "parent,/camera/frame,drawings")
+    status, said = answered("compare", first, second, "--ignore", "parent,/camera/frame,drawings")
     assert status == 0, said
     assert "without parent, /camera/frame, drawings" in said.splitlines()[-1]
 
@@ -172,22 +165,19 @@ def test_images_that_a_replay_did_not_copy_are_told_with_what_leaves_them_out(
 def test_what_is_in_one_session_only_is_one_line_a_topic(tmp_path: Path, ticks: list[Tick]) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     second = small_session(tmp_path / "b.mcap", ticks, sets=("recording.leave_out=['/truth/*']",))
-    status, said = run("compare", first, second, "--json")
+    status, said = answered("compare", first, second, "--json")
     found = json.loads(said)
     assert status == 3 and not found["same"]
-    assert found["apart"] == {
-        "/truth/robot": "only in a.mcap, 20 messages",
-        "/truth/flow": "only in a.mcap, 1 message",
-    }
+    assert found["apart"] == {"/truth/robot": "only in a.mcap, 20 messages", "/truth/flow": "only in a.mcap, 1 message"}
     assert found["head"]["configuration"].keys() == {"recording.leave_out"}
-    status, said = run("compare", first, second, "--ignore", "truth", "--ignore", "configuration.recording")
+    status, said = answered("compare", first, second, "--ignore", "truth", "--ignore", "configuration.recording")
     assert status == 0, said
 
 
 def test_a_byte_copy_is_one_line(tmp_path: Path, ticks: list[Tick]) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     (tmp_path / "b.mcap").write_bytes(first.read_bytes())
-    status, said = run("compare", first, tmp_path / "b.mcap")
+    status, said = answered("compare", first, tmp_path / "b.mcap")
     assert status == 0
     assert said == f"a.mcap and b.mcap: identical byte for byte ({first.stat().st_size / 1e6:.1f} MB)\n"
 
@@ -195,13 +185,13 @@ def test_a_byte_copy_is_one_line(tmp_path: Path, ticks: list[Tick]) -> None:
 def test_another_origin_is_a_difference_that_can_be_left_out(tmp_path: Path, ticks: list[Tick]) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     rewrite(first, tmp_path / "b.mcap", edit_head=edit_of_head("flowrec.provenance", host="elsewhere"), redigest=True)
-    status, said = run("compare", first, tmp_path / "b.mcap")
+    status, said = answered("compare", first, tmp_path / "b.mcap")
     assert status == 3
     assert "provenance 1 of 3 DIFFERENT: host (lab, elsewhere)" in " ".join(said.split())
     assert "DIFFERENT in provenance (" in said.splitlines()[-1]
-    assert run("compare", first, tmp_path / "b.mcap", "--ignore", "provenance.host")[0] == 0
-    assert run("compare", first, tmp_path / "b.mcap", "--only", "/robot/*")[0] == 0
-    status, said = run("compare", first, tmp_path / "b.mcap", "--ignore", "provenace")
+    assert answered("compare", first, tmp_path / "b.mcap", "--ignore", "provenance.host")[0] == 0
+    assert answered("compare", first, tmp_path / "b.mcap", "--only", "/robot/*")[0] == 0
+    status, said = answered("compare", first, tmp_path / "b.mcap", "--ignore", "provenace")
     assert status != 0 and "0 of" not in said
 
 
@@ -225,12 +215,12 @@ def test_a_comparison_that_is_stopped_says_what_it_compared(tmp_path: Path, tick
 
 @pytest.mark.slow("replays a mission")
 def test_a_replay_differs_from_its_recording_by_nature_only_and_this_is_said(session: Path, tmp_path: Path) -> None:
-    assert run("replay", session, "--out", tmp_path / "again.mcap", "--json")[0] == 0
-    status, said = run("compare", session, tmp_path / "again.mcap", "--json")
+    assert answered("replay", session, "--out", tmp_path / "again.mcap", "--json")[0] == 0
+    status, said = answered("compare", session, tmp_path / "again.mcap", "--json")
     found = json.loads(said)
     assert status == 3
     assert found["by_nature"] == ["provenance", "parent", "outcome", "diagnostics", "/camera/frame"]
-    status, said = run("compare", session, tmp_path / "again.mcap", "--ignore", ",".join(found["by_nature"]))
+    status, said = answered("compare", session, tmp_path / "again.mcap", "--ignore", ",".join(found["by_nature"]))
     assert status == 0, said
     assert "ticks: identical" in said
 

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flowrec.core.diagnostics import CameraLosses
 from flowrec.physics.chip.chip import ChipSettings
@@ -22,8 +21,8 @@ from flowrec.rigs.lab.cameras.camera import CameraInfo
 from flowrec.stages.config import Config, load_config, registration_of, with_sets
 from flowrec.stages.resolve import resolve
 from flowrec.verbs import diagnosis
-from flowrec.verbs.cli import app
 from flowrec.verbs.diagnosis import FAILURE, OK, WARNING, diagnose
+from tests.conftest import invoke
 from tests.physics.chip.looks import LOOKS, picture
 
 MEASURED = (
@@ -147,7 +146,7 @@ def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_
     monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
     sets = [*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
     words = ["doctor", "--json", "--folder", str(tmp_path), *(word for text in sets for word in ("--set", text))]
-    done = CliRunner().invoke(app, words)
+    done = invoke(*words)
     assert done.exit_code == 1
     found = json.loads(done.stdout)
     assert found["level"] == "failure"
@@ -195,7 +194,7 @@ def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_s
     }.items():
         sets = [*MEASURED, *devices, wrong]
         words = ["doctor", "--json", "--folder", str(tmp_path), *(word for each in sets for word in ("--set", each))]
-        done = CliRunner().invoke(app, words)
+        done = invoke(*words)
         assert done.exit_code == 1, done.output
         failures = {one["what"]: one["text"] for one in json.loads(done.stdout)["findings"] if one["level"] == FAILURE}
         assert text in failures["settings"], wrong
@@ -204,6 +203,6 @@ def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_s
 
 
 def test_settings_that_are_not_measured_are_a_failure_that_names_them() -> None:
-    done = CliRunner().invoke(app, ["doctor", "--rig", "lab"])
+    done = invoke("doctor", "--rig", "lab")
     assert done.exit_code == 1
     assert "x settings" in done.stdout and "robot.radius_um" in done.stdout

@@ -11,7 +11,6 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core.errors import SessionError, UsageError
@@ -19,8 +18,8 @@ from flowrec.core.system.outputs import OutputError
 from flowrec.exports.formats import EXPORTS
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import app
 from flowrec.verbs.view import view
+from tests.conftest import invoke
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
@@ -84,7 +83,7 @@ def test_an_export_replaces_an_earlier_export_of_the_same_session_and_no_other_f
 
 
 def test_the_help_of_export_lists_every_format_with_its_summary(any_export: str) -> None:
-    shown = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).stdout
+    shown = invoke("export", "--help", env={"COLUMNS": "200"}).stdout
     words = " ".join(shown.split())
     assert f"{any_export}: {EXPORTS[any_export].summary}" in words
 
@@ -196,7 +195,7 @@ def test_a_format_with_a_suffix_is_written_into_an_existing_folder(tmp_path: Pat
 
 
 def test_the_verb_takes_the_folder_as_a_word_and_says_what_it_made(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["export", str(GOLDEN), str(tmp_path / "t"), "--format", "parquet", "--json"])
+    done = invoke("export", GOLDEN, tmp_path / "t", "--format", "parquet", "--json")
     facts = json.loads(done.stdout)
     nbytes = sum(path.stat().st_size for path in (tmp_path / "t").iterdir())
     covered = facts.pop("covered")

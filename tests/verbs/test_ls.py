@@ -10,7 +10,6 @@ import threading
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 from websockets.sync.client import connect
 
 from flowrec.core.errors import SessionError, UsageError
@@ -20,16 +19,11 @@ from flowrec.store.notes import notes_file
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import app
 from flowrec.verbs.listing import read_each
 from flowrec.verbs.ls import ls
 from flowrec.verbs.view import view as view_session
-from tests.conftest import HANG_S
+from tests.conftest import HANG_S, typed
 from tests.store.made_up import HEADER, ticks_of
-
-
-def typed(*words: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
 
 
 def write(path: Path, count: int, **figures: float) -> Path:
@@ -86,10 +80,7 @@ def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_pat
         assert rows["x.mcap.partial"]["outcome"] == "recording"  # other runs of this machine may stand beside it
         words = [sys.executable, "-m", "flowrec", "view", path, "--live", "--console", "--no-open"]
         control = RunControl()
-        with (
-            CommandSocket(path, control, print),
-            subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as view,
-        ):
+        with CommandSocket(path, control, print), subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as view:
             assert view.stderr is not None
             told = [view.stderr.readline() for _ in range(4)]
             assert "rerun --connect" in told[0] and "Ctrl-C ends the view" in told[3]

@@ -15,7 +15,6 @@ from threading import Event
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.archive.push import PushedFile, push
@@ -29,8 +28,7 @@ from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import TRAFFIC
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import app
-from tests.conftest import HANG_S, until
+from tests.conftest import HANG_S, invoke, until
 from tests.store.made_up import ticks_of
 from tests.store.s3_server import BUCKET, KEYS, S3Server, s3_server
 from tests.store.test_run_files import HEADER, in_parts
@@ -188,7 +186,7 @@ def test_a_server_in_trouble_is_asked_again_and_that_is_said(server: S3Server, l
     failing = iter([500, 503, None, None, 500])
     server.fault = lambda method, _: next(failing, None) if method in ("PUT", "POST") else None
     TRAFFIC.repeated = 0
-    done = CliRunner().invoke(app, ["push", str(large), TARGET, "--json"])
+    done = invoke("push", large, TARGET, "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["repeated_requests"] == 3
     assert content(server, "large.mcap") == large.read_bytes()
@@ -392,11 +390,7 @@ def test_two_sessions_of_one_name_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("sent", "told"),
-    [
-        (3_000_000, "3.0 MB sent, compared"),
-        (1_000_000, "3.0 MB sent, 1.0 MB of them now, c"),
-        (0, "is there already"),
-    ],
+    [(3_000_000, "3.0 MB sent, compared"), (1_000_000, "3.0 MB sent, 1.0 MB of them now, c"), (0, "is there already")],
 )
 def test_what_was_sent_by_an_earlier_call_is_told_apart(tmp_path: Path, sent: int, told: str) -> None:
     file = PushedFile(tmp_path / "a.mcap", UrlPath("s3://lab/a.mcap"), 3_000_000, sent, "", "by reading all of it")

@@ -8,14 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core.errors import UsageError
 from flowrec.core.topics import TOPICS
-from flowrec.verbs.cli import app
 from flowrec.verbs.replay_result import BeforeAfter
-from tests.conftest import HANG_S
+from tests.conftest import HANG_S, invoke
 from tests.extras import why
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
@@ -54,7 +52,7 @@ def test_replays_in_threads_and_in_a_notebook_make_the_bytes_that_the_verb_makes
 ) -> None:
     by_verb = tmp_path / "verb.mcap"
     words = ["replay", str(GOLDEN), "--plan", "astar_length", "--out", str(by_verb), "--json"]
-    done = CliRunner().invoke(app, words)
+    done = invoke(*words)
     assert done.exit_code == 0, done.output
     with ThreadPoolExecutor(2) as threads:
         running = [

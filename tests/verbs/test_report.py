@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core.enums import Outcome
@@ -34,9 +33,8 @@ from flowrec.exports.report.timeline_figure import TimelineFigure
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs import report_page as command
-from flowrec.verbs.cli import app
 from flowrec.view.colours import ColourScale, Table
-from tests.conftest import made_once
+from tests.conftest import invoke, made_once
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
 GOLDEN, MODERATE = SESSIONS / "golden.mcap", SESSIONS / "golden_moderate.mcap"
@@ -266,7 +264,7 @@ def test_bad_files_are_refused_in_one_line_and_leave_nothing(tmp_path: Path, mon
     unfinished.write_bytes(GOLDEN.read_bytes()[:-5000])
     before = set(tmp_path.iterdir())
     for bad in (foreign, unfinished, tmp_path / "none.mcap"):
-        done = CliRunner().invoke(app, ["report", str(bad), "-o", str(tmp_path / "a.html")])
+        done = invoke("report", bad, "-o", tmp_path / "a.html")
         assert isinstance(done.exception, FlowrecError) and "\n" not in str(done.exception)
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "jinja2" else find(name))

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core.errors import UsageError
 from flowrec.stages import load_config, robot_topic
 from flowrec.stages.robot_topics import track_of
 from flowrec.verbs.align import asked_import, fit_import
-from flowrec.verbs.cli import app
 from flowrec.verbs.compare import compare
+from tests.conftest import answered
 from tests.rewritten import leaves_of, rewrite
 from tests.short_missions import SMALL
 
@@ -28,15 +27,9 @@ COMPUTED = [robot_topic(path, number) for path in ("/robot/track", "/robot/estim
 OBSERVED = [robot_topic("/robot/observations", number) for number in (1, 2)]
 
 
-def run(*words: object) -> tuple[int, str]:
-    """Exit status and what was printed."""
-    done = CliRunner().invoke(app, [str(word) for word in words])
-    return done.exit_code, done.output
-
-
 def recorded(path: Path, *sets: str) -> Path:
     chosen = [word for each in (*SEVERAL, *sets) for word in ("--set", each)]
-    status, said = run("record", *chosen, "--duration", 2, "--out", path)
+    status, said = answered("record", *chosen, "--duration", 2, "--out", path)
     assert status == 0, said
     return path
 
@@ -47,7 +40,7 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def verified(path: Path, *more: object) -> tuple[int, dict[str, Any]]:
-    status, said = run("replay", path, "--verify", "--json", *more)
+    status, said = answered("replay", path, "--verify", "--json", *more)
     return status, json.loads(said)
 
 
@@ -59,7 +52,7 @@ def test_a_replay_computes_all_robots_again_also_from_the_middle(mission: Path, 
         assert found["topics"][path]["identical"] > 30 and not found["topics"][path]["different"], path
     for path in OBSERVED:
         assert found["topics"][path]["identical"] and not found["topics"][path]["different"], path
-    assert run("check", mission)[0] == 0
+    assert answered("check", mission)[0] == 0
 
 
 @pytest.mark.parametrize("path", [*COMPUTED[1:3], "/robots/walls"])
@@ -102,7 +95,9 @@ def test_a_comparison_tells_which_robot_differs(mission: Path, tmp_path: Path) -
 
 
 def test_the_first_robot_may_be_replayed_alone(mission: Path) -> None:
-    status, said = run("replay", mission, "--set", "tracker.robots=1", "--json", "--out", mission.with_name("one.mcap"))
+    status, said = answered(
+        "replay", mission, "--set", "tracker.robots=1", "--json", "--out", mission.with_name("one.mcap")
+    )
     assert status == 0, said
     session = flowrec.open(mission.with_name("one.mcap"))
     assert session.topics["/robot/track"] > 30 and "/robot/1/track" not in session.topics
@@ -110,7 +105,7 @@ def test_the_first_robot_may_be_replayed_alone(mission: Path) -> None:
 
 
 def test_tables_have_one_for_each_robot_and_its_truth(mission: Path, tmp_path: Path) -> None:
-    status, said = run("export", mission, tmp_path / "tables", "--format", "parquet")
+    status, said = answered("export", mission, tmp_path / "tables", "--format", "parquet")
     assert status == 0, said
     for number in (1, 2):
         track, truth = (
@@ -130,7 +125,7 @@ def movie(mission: Path) -> tuple[Path, Path, list[list[float]]]:
     """The images of the mission, the log of its coils, and where its robots are in the first image, in px."""
     file, tables = mission.with_name("movie.ome.tif"), mission.with_name("tables")
     for target, kind in ((file, "tiff"), (tables, "csv")):
-        status, said = run("export", mission, target, "--format", kind)
+        status, said = answered("export", mission, target, "--format", kind)
         assert status == 0, said
     session = flowrec.open(mission)
     first = next(iter(session.ticks()))
@@ -182,5 +177,5 @@ def test_a_line_for_each_other_robot_ends_a_run_and_stands_in_its_session(missio
         ]
         truth = ticks[-1].extra[min(contacts)[1]]
         assert f", {truth.contacts} wall contact" in text
-    status, said = run("info", mission)
+    status, said = answered("info", mission)
     assert status == 0 and "robot 1" in said and "tracked in" in said

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Metadata, Schema
-from typer.testing import CliRunner
 
 from flowrec.core.declarations import Role
 from flowrec.core.diagnostics import CameraLosses, Clocks, Drops
@@ -37,8 +36,8 @@ from flowrec.store.session_writer import session_header
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
 from flowrec.verbs.check import check
-from flowrec.verbs.cli import app
 from flowrec.verbs.compare import compare
+from tests.conftest import answered
 from tests.rewritten import EDITS, leaves_of, parser_of, rewrite
 from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of
@@ -48,12 +47,6 @@ AGAIN = pytest.mark.slow("verifies a mission again")
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 PATHS = [topic.path for topic in TOPICS]
 VIEWS = [mirror.path for mirror in VIEWER_TOPICS if mirror.schema.wire is not None]
-
-
-def run(*words: object) -> tuple[int, str]:
-    """Exit status and what was printed."""
-    done = CliRunner().invoke(app, [str(word) for word in words])
-    return done.exit_code, done.output
 
 
 def every_topic() -> list[Tick]:
@@ -152,7 +145,7 @@ def test_an_edit_is_a_difference_and_check_never_says_more_than_it_knows(
             found = compare(small, path)
             assert found.exit_status == 3 and found.as_json()["same"] is False, name
             assert different in found.as_json()["different"], (name, found.lines())
-    status, said = run("compare", small, out, "--json")
+    status, said = answered("compare", small, out, "--json")
     assert status == 3 and different in json.loads(said)["different"]
 
 
@@ -240,7 +233,7 @@ def test_what_another_program_adds_is_no_edit(small: Path, tmp_path: Path) -> No
 def test_an_unchanged_session_written_anew_by_another_program_passes(session: Path, tmp_path: Path) -> None:
     rewrite(session, tmp_path / "again.mcap")
     assert check(tmp_path / "again.mcap").exit_status == 0
-    status, said = run("replay", tmp_path / "again.mcap", "--verify")
+    status, said = answered("replay", tmp_path / "again.mcap", "--verify")
     assert status == 0, said
     assert "every tick identical" in said
 
@@ -256,7 +249,7 @@ def test_an_edit_that_no_replay_can_see_fails_verify_by_the_digest(session: Path
 
     edited: list[bool] = []
     assert rewrite(session, tmp_path / "edited.mcap", edit) == 1
-    status, said = run("replay", tmp_path / "edited.mcap", "--verify", "--json")
+    status, said = answered("replay", tmp_path / "edited.mcap", "--verify", "--json")
     found = json.loads(said)
     assert status == 3 and not found["same"]
     assert found["different_ticks"] == 0
@@ -284,7 +277,7 @@ def test_the_replay_itself_finds_an_edit_of_each_topic_that_it_computes(session:
 
     rewrite(session, tmp_path / "edited.mcap", edit, keep_digest=False)
     assert edited == computed
-    status, said = run("replay", tmp_path / "edited.mcap", "--verify", "--json")
+    status, said = answered("replay", tmp_path / "edited.mcap", "--verify", "--json")
     assert status == 3
     topics = json.loads(said)["topics"]
     assert {topic for topic in computed if topics[topic]["different"] == 1} == computed
@@ -321,7 +314,7 @@ def test_the_replay_itself_finds_an_edit_of_what_the_worker_gave(
         return True
 
     assert rewrite(GOLDEN, tmp_path / "edited.mcap", edit) > 0
-    status, said = run(
+    status, said = answered(
         "replay", tmp_path / "edited.mcap", "--verify", "--json", *(["--from", from_s] if from_s else [])
     )
     found = json.loads(said)
@@ -338,7 +331,7 @@ def test_what_verify_prints_of_a_file_has_its_control_characters_escaped(tmp_pat
         return False
 
     assert rewrite(GOLDEN, tmp_path / "edited.mcap", edit) > 1
-    status, said = run("replay", tmp_path / "edited.mcap", "--verify")
+    status, said = answered("replay", tmp_path / "edited.mcap", "--verify")
     assert status == 3
     assert "\x1b" not in said
     assert "\\x1b]0;gone\\x07" in said

@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.archive.catalog.format import EVENTS, KEY, NAME, PARQUET, PLACE, SIGNATURE, SWEEP, About
-from flowrec.core import FlowrecError, Output, OutputError, UsageError, open_new, refuse_irregular, replacing, unit_of
+from flowrec.core import FlowrecError, Output, OutputError, needs, open_new, refuse_irregular, replacing, unit_of
 from flowrec.verbs import ALWAYS, LISTS, kind_of
 
-try:
+with needs("a catalog", "catalog"):
     import pyarrow as pa
     import pyarrow.parquet as pq
-except ModuleNotFoundError as error:
-    raise UsageError("a catalog needs pyarrow, which is not installed: pip install 'flowrec[catalog]'") from error
 
 _LOCK = ".lock"
 _LEVEL = 1  # of zstd
@@ -47,9 +45,7 @@ class Known:
 def read(path: Path) -> Known:
     """Read the contents of an earlier catalog: no session where there is none, or it can not be used.
 
-    Raises
-    ------
-    OutputError : the file is something else, which is never replaced.
+    Raises OutputError: the file is something else, which is never replaced.
     """
     if not os.path.lexists(path):
         return Known(table_of([]))
@@ -76,9 +72,7 @@ def read(path: Path) -> Known:
 def lock_catalog(path: Path) -> Iterator[None]:
     """Keep other processes from refreshing a catalog.
 
-    Raises
-    ------
-    OutputError : another one does so just now, or the file may not be written.
+    Raises OutputError: another one does so just now, or the file may not be written.
     """
     Output(path, PARQUET, overwrite=True).check()
     lock = path.with_name(f".{path.name}{_LOCK}")

@@ -30,19 +30,13 @@ _IN_FLOW_ERROR = ("assumed_flow_error", "refined_flow_error")
 
 @dataclass(frozen=True, slots=True)
 class FoundSessions:
-    """Rows of a catalog that match an expression.
+    """Rows of a catalog that match an expression."""
 
-    Attributes
-    ----------
-    catalog : the file.
-    rows : values by column, of the session and, where the expression mentions them, of a replay or an event each.
-    mentioned : columns that the expression names.
-    """
-
-    catalog: Path
+    catalog: Path  # the file
     about: About
+    # values by column, of the session and, where the expression mentions them, of a replay or an event each
     rows: list[dict[str, Any]]
-    mentioned: list[str]
+    mentioned: list[str]  # columns that the expression names
 
     def paths(self) -> list[str]:
         """The sessions, each once, as they are named from this folder; `os.fsencode` makes the bytes of their names."""
@@ -117,17 +111,14 @@ def find(where: str = "", catalog: Path | None = None, sort: str = "", limit: in
 
     `sweep.refine`, `sweep.replayed_refined_flow_error` and so on are of the session's replays in tables of `flowrec
     sweep`, `sweep.place` is 1 for the best of them; `events.time_s`, `events.action` and `events.text` are of what the
-    operator did. A session then has a row for each replay or event.
+    operator did. A session then has a row for each replay or event. Raises UsageError: there is no catalog, or the
+    expression is refused.
 
     Parameters
     ----------
     catalog : the file, or its folder; None: the one of this folder, or of the next one above that has one.
     sort : a column, with a leading `-` from the largest.
     limit : of the number of rows.
-
-    Raises
-    ------
-    UsageError : there is no catalog, or the expression is refused.
     """
     path = catalog_above(catalog).absolute()
     with open_catalog(path) as (about, table):

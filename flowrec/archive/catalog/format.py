@@ -24,22 +24,14 @@ PLACE = "path_bytes"  # column that identifies a session, in bytes: a file's nam
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """Metadata of a catalog.
+    """Metadata of a catalog."""
 
-    Attributes
-    ----------
-    places : what is catalogued; folders and files relative to the folder of the catalog, where they are below it.
-    sessions : how many.
-    made : time in UTC, ISO 8601.
-    flowrec : version that made it.
-    left : sessions that were not read before it was interrupted.
-    """
-
+    # what is catalogued; folders and files relative to the folder of the catalog, where they are below it
     places: Sequence[str]
-    sessions: int
-    made: str
-    flowrec: str
-    left: int = 0
+    sessions: int  # how many
+    made: str  # time in UTC, ISO 8601
+    flowrec: str  # version that made it
+    left: int = 0  # sessions that were not read before it was interrupted
     format: int = FORMAT
 
     def to_json(self) -> str:
@@ -73,9 +65,7 @@ def path_of(text: str, base: Path) -> Path:
 def catalog_above(named: Path | None) -> Path:
     """The catalog that is named, or in the folder that is; None: the one in this folder, or the next one above.
 
-    Raises
-    ------
-    UsageError : there is none.
+    Raises UsageError: there is none.
     """
     if named is not None:
         path = named / NAME if named.is_dir() else named

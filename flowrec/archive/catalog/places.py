@@ -25,30 +25,18 @@ from flowrec.verbs import NAMES, runs_of
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A session, or a run with all its parts.
-
-    Attributes
-    ----------
-    files : its own, as `verbs.ls.runs_of` returns them.
-    signature : text that changes where size or time, at a URL the version, of a file or of its notes does.
-    """
+    """A session, or a run with all its parts."""
 
     path: Path
-    files: Sequence[Path]
-    signature: str
+    files: Sequence[Path]  # its own, as `verbs.ls.runs_of` returns them
+    signature: str  # text that changes where size or time, at a URL the version, of a file or of its notes does
 
 
 def contents_of(places: Iterable[Path], without: Path) -> tuple[list[Found], list[Path]]:
     """List the sessions in folders, and those that are named, in order of name; and tables that may be of sweeps.
 
-    Parameters
-    ----------
-    without : the catalog itself.
-
-    Raises
-    ------
-    SessionError : a place is not there, or can not be listed.
-    UsageError : a place is neither a folder nor a session.
+    `without`: the catalog itself. Raises SessionError: a place is not there, or can not be listed; UsageError: a place
+    is neither a folder nor a session.
     """
     marks: dict[Path, str] = {}
     for place in places:

@@ -29,28 +29,18 @@ _EVENTS_LIMIT = 10_000  # of a session; no person makes more
 
 @dataclass(frozen=True, slots=True)
 class Refreshed:
-    """Result of a refresh.
-
-    Attributes
-    ----------
-    sessions : in the catalog, of which `new`, `changed` and `broken`, that is unreadable, unfinished or recording.
-    gone : sessions that were in the catalog and are no longer there.
-    replays : of sweeps.
-    left : sessions that were not read before an interruption.
-    stop_status : exit status of that interruption.
-    remarks : lines about what could not be used.
-    """
+    """Result of a refresh."""
 
     path: Path
-    sessions: int
+    sessions: int  # in the catalog, of which `new`, `changed` and `broken`, that is unreadable, unfinished or recording
     new: int
     changed: int
-    gone: int
+    gone: int  # sessions that were in the catalog and are no longer there
     broken: int
-    replays: int
-    left: int = 0
-    stop_status: int = 0
-    remarks: tuple[str, ...] = ()
+    replays: int  # of sweeps
+    left: int = 0  # sessions that were not read before an interruption
+    stop_status: int = 0  # exit status of that interruption
+    remarks: tuple[str, ...] = ()  # lines about what could not be used
 
     def as_json(self) -> dict[str, Any]:
         """All of it."""
@@ -188,9 +178,7 @@ def _read(due: dict[str, Found], progress: Callable[[float], None], jobs: int) -
 def row_of(found: Found, path: str) -> dict[str, Any]:
     """Values by column. A session that can not be opened is a row, too, with the reason as its note.
 
-    Parameters
-    ----------
-    path : as the catalog states it.
+    `path`: as the catalog states it.
     """
     try:
         listed, opened = describe(found.path, found.files, found.path.name)

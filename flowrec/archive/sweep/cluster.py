@@ -18,16 +18,14 @@ from typing import Any
 
 from flowrec.archive.sweep.replay_process import Row, failed_row, replay_task
 from flowrec.archive.sweep.tasks import Task
-from flowrec.core import NUMERICS_VERSION, FlowrecError, UsageError, __version__
+from flowrec.core import NUMERICS_VERSION, FlowrecError, UsageError, __version__, needs
 
-try:
+with needs("a sweep", "cluster", "Dask"):
     import dask
     import distributed
     from distributed.comm import CommClosedError
     from distributed.utils import silence_logging_cmgr
     from distributed.versions import VersionMismatchWarning
-except ModuleNotFoundError as error:
-    raise UsageError("a sweep needs Dask, which is not installed: pip install 'flowrec[cluster]'") from error
 
 _CONNECT_S = 10.0
 _STARTS = 3  # tries, because a worker may be killed before it is ready
@@ -39,15 +37,13 @@ _COMPARED = ("distributed", "dask")
 def workers_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     """A client of Dask.
 
+    Raises UsageError: the address can not be one; FlowrecError: no scheduler answers there, or it is of another
+    version.
+
     Parameters
     ----------
     scheduler : address of a scheduler, such as tcp://10.0.0.1:8786; None: workers of this machine, on 127.0.0.1.
     workers : how many of this machine; None: one for each core.
-
-    Raises
-    ------
-    UsageError : the address can not be one.
-    FlowrecError : no scheduler answers there, or it is of another version.
     """
     with ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
@@ -157,14 +153,8 @@ def _replayed_by_worker(task: Task) -> Row:
 def rows_of(client: Any, tasks: Iterable[Task], *, local: bool) -> Iterator[Row]:
     """The rows of tasks in the order in which they are done; few of them are in memory at a time.
 
-    Parameters
-    ----------
-    local : the workers are of this machine: none is given a task while it has one, so that a worker that dies fails no
-        task but its own.
-
-    Raises
-    ------
-    FlowrecError : the scheduler has ended.
+    `local`: the workers are of this machine: none is given a task while it has one, so that a worker that dies fails no
+    task but its own. Raises FlowrecError: the scheduler has ended.
     """
     waiting, running, done = iter(tasks), dict[str, Task](), distributed.as_completed()
 

@@ -20,26 +20,16 @@ INTERVAL = "Student's t over sessions, 95 % each; not corrected for the number o
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """Settings, or a reference that every session has.
+    """Settings, or a reference that every session has."""
 
-    Attributes
-    ----------
-    settings : as text.
-    mean : of the figure over the common sessions; None without any.
-    difference : mean of its difference from the first of the ranking, paired by session; None for the first itself.
-    interval : of the difference, 95 %; None for fewer than two sessions.
-    values : of the common sessions, in the same order for every setting.
-    failed : tasks that ended with an error.
-    cpu_s : mean of a task; None of a reference.
-    """
-
-    settings: str
-    mean: float | None
+    settings: str  # as text
+    mean: float | None  # of the figure over the common sessions; None without any
+    # mean of its difference from the first of the ranking, paired by session; None for the first itself
     difference: float | None
-    interval: tuple[float, float] | None
-    values: tuple[float, ...]
-    failed: int = 0
-    cpu_s: float | None = None
+    interval: tuple[float, float] | None  # of the difference, 95 %; None for fewer than two sessions
+    values: tuple[float, ...]  # of the common sessions, in the same order for every setting
+    failed: int = 0  # tasks that ended with an error
+    cpu_s: float | None = None  # mean of a task; None of a reference
 
     def as_json(self) -> dict[str, Any]:
         """All of it but the values."""
@@ -48,18 +38,11 @@ class Ranked:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """The settings of a sweep, the best first.
+    """The settings of a sweep, the best first."""
 
-    Attributes
-    ----------
-    figure : by which they are ranked; '' where no task has one.
-    sessions : the number of sessions with that figure in every setting: the common sessions.
-    of_sessions : of how many.
-    """
-
-    figure: str
-    sessions: int
-    of_sessions: int
+    figure: str  # by which they are ranked; '' where no task has one
+    sessions: int  # the number of sessions with that figure in every setting: the common sessions
+    of_sessions: int  # of how many
     rows: tuple[Ranked, ...]
 
     @classmethod
@@ -67,15 +50,8 @@ class Ranking:
         """Rank the settings of some rows.
 
         Of a session that was replayed by several versions with the same settings, the last row counts. A setting that
-        has the figure in no session is last and does not narrow the common sessions.
-
-        Parameters
-        ----------
-        figure : by which they are ranked; None: the first of RANKED_BY that a row has.
-
-        Raises
-        ------
-        UsageError : no row has that figure as a number.
+        has the figure in no session is last and does not narrow the common sessions. `figure`: by which they are
+        ranked; None: the first of RANKED_BY that a row has. Raises UsageError: no row has that figure as a number.
         """
         by_settings: dict[str, dict[str, Row]] = {}
         for row in rows:

@@ -48,9 +48,7 @@ class _LimitError(_EndedError):
 def replay_task(task: Task, memory_bytes: int | None = None) -> Row:
     """Replay a session in the process of this thread; the row of the task, with an error where it has failed.
 
-    Parameters
-    ----------
-    memory_bytes : the limit of a task that states none.
+    `memory_bytes`: the limit of a task that states none.
     """
     task = replace(task, memory_bytes=task.memory_bytes or memory_bytes)
     row: Row = {}

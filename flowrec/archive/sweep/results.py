@@ -19,7 +19,7 @@ from flowrec.core import (
     Output,
     OutputError,
     SessionError,
-    UsageError,
+    needs,
     replace_content,
     replacing,
     sync_directory,
@@ -28,11 +28,9 @@ from flowrec.core import (
 )
 from flowrec.store import UrlPath
 
-try:
+with needs("a sweep", "cluster"):
     import pyarrow as pa
     import pyarrow.parquet as pq
-except ModuleNotFoundError as error:
-    raise UsageError("a sweep needs pyarrow, which is not installed: pip install 'flowrec[cluster]'") from error
 
 PARQUET = (".parquet",)
 _OURS = b"flowrec_sweep"  # key of the file's metadata: which columns are settings and figures, as JSON
@@ -80,14 +78,12 @@ class Results:
     def open_locked(cls, path: Path, inputs: Iterable[Path], contents: Collection[str]) -> Iterator[Self]:
         """The results under a name, for one process at a time; gathered into the file however the block ends.
 
+        Raises OutputError: it may not be written, or holds something else than a sweep of some of these sessions.
+
         Parameters
         ----------
         inputs : files that are read, none of which the output may be.
         contents : hashes of the sessions of this sweep.
-
-        Raises
-        ------
-        OutputError : it may not be written, or holds something else than a sweep of some of these sessions.
         """
         Output(path, PARQUET, tuple(each for each in inputs if not isinstance(each, UrlPath)), overwrite=True).check()
         results = cls(path)
@@ -175,10 +171,7 @@ class Results:
 def read_rows(path: Path) -> list[Row]:
     """The rows of a sweep's file, as its tasks returned them.
 
-    Raises
-    ------
-    SessionError : there is no such file, or it can not be read.
-    OutputError : it is none of `flowrec sweep`.
+    Raises SessionError: there is no such file, or it can not be read; OutputError: it is none of `flowrec sweep`.
     """
     try:
         table = pq.read_table(path, partitioning=None)
@@ -231,9 +224,7 @@ def _table(rows: Sequence[Row]) -> pa.Table:
 def array_of(values: Sequence[Any], empty: pa.DataType | None = None) -> pa.Array:
     """Values of one kind; whole and broken numbers are float64, any other mixture is text.
 
-    Parameters
-    ----------
-    empty : type of values that are all unknown; None: text.
+    `empty`: type of values that are all unknown; None: text.
     """
     kinds = {type(value) for value in values if value is not None}
     if kinds == {int, float}:

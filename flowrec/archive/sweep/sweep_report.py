@@ -23,15 +23,13 @@ _ROW_MM, _MARGIN_MM = 7.0, 14.0
 def report_sweep(sweep: Path, out: Path | None = None, overwrite: bool = False) -> Path:
     """Write the page of a sweep: one HTML file that needs no network and no script.
 
+    Raises UsageError: a package of the extra `report` is not installed; SessionError: the file can not be read, or the
+    page not be written.
+
     Parameters
     ----------
     sweep : a file of `flowrec sweep` (.parquet).
     out : the page (.html); by default SWEEP_report.html beside it.
-
-    Raises
-    ------
-    UsageError : a package of the extra `report` is not installed.
-    SessionError : the file can not be read, or the page not be written.
     """
     require_packages()
     from flowrec.exports import render, style

@@ -13,14 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flowrec.core import NUMERICS_VERSION, REPLAYED, SessionError, UsageError, __version__
-from flowrec.store import (
-    SESSION_SUFFIX,
-    Session,
-    UrlPath,
-    run_files,
-    session_path,
-    session_sha256,
-)
+from flowrec.store import SESSION_SUFFIX, Session, UrlPath, run_files, session_path, session_sha256
 from flowrec.verbs import read_each, runs_of
 
 if TYPE_CHECKING:
@@ -74,15 +67,13 @@ def change_of(settings: Settings) -> Change:
 def combinations(grid: Sequence[str], sets: Sequence[str], columns: Sequence[str] = ()) -> list[Settings]:
     """Every combination of the values of a grid.
 
+    Raises UsageError: a text is no `key=value`, a key is named twice, or a recording fixes it.
+
     Parameters
     ----------
     grid : texts such as `refine=fvm,assimilate`; a comma within brackets belongs to its value.
     sets : texts `key=value` that hold for all combinations.
     columns : names that a key may not have.
-
-    Raises
-    ------
-    UsageError : a text is no `key=value`, a key is named twice, or a recording fixes it.
     """
     from flowrec.verbs import FIXED
 
@@ -120,9 +111,7 @@ def _split(text: str) -> list[str]:
 def session_files(places: Sequence[str]) -> list[Path]:
     """The sessions that files, URLs, folders and patterns such as `runs/*.mcap` name, each once; parts as their run.
 
-    Raises
-    ------
-    UsageError : one of them names no session.
+    Raises UsageError: one of them names no session.
     """
     found: dict[Path, None] = {}
     for place in places:
@@ -150,11 +139,7 @@ def content_of(session: Session) -> str:
     """Hash of the content of a session, 32 hexadecimal digits.
 
     It is made of the digests that its files state of their messages and header, so no message is read. Of files of the
-    first release, which state none, it is that of the bytes.
-
-    Raises
-    ------
-    SessionError : the session can not be read.
+    first release, which state none, it is that of the bytes. Raises SessionError: the session can not be read.
     """
     digests = [file.digest or {"file": session_sha256([file.path])} for file in session.run.files]
     return hashlib.sha256(json.dumps([sorted(each.items()) for each in digests]).encode()).hexdigest()[:32]
@@ -162,26 +147,18 @@ def content_of(session: Session) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Sessions:
-    """The sessions of a sweep.
+    """The sessions of a sweep."""
 
-    Attributes
-    ----------
-    by_content : one file for each content, by its hash.
-    left_out : lines of text about files that are not replayed: copies, replays, and what is no whole session.
-    unreadable : how many of those are no whole sessions.
-    """
-
-    by_content: dict[str, Path]
+    by_content: dict[str, Path]  # one file for each content, by its hash
+    # lines of text about files that are not replayed: copies, replays, and what is no whole session
     left_out: list[str]
-    unreadable: int
+    unreadable: int  # how many of those are no whole sessions
 
     @classmethod
     def of(cls, files: Sequence[Path], progress: Callable[[int], None] = lambda _: None) -> Sessions:
         """Read the heads and indexes of files; `progress` takes how many are read.
 
-        Raises
-        ------
-        UsageError : none of them can be replayed.
+        Raises UsageError: none of them can be replayed.
         """
         found: dict[str, Path] = {}
         left_out: list[str] = []

@@ -88,13 +88,7 @@ def _make(path: Path, rng: np.random.Generator) -> None:
 
 
 def read_lesson(path: Path) -> Lesson:
-    """Read one lesson.
-
-    Raises
-    ------
-    UsageError
-        If the file is not a lesson.
-    """
+    """Read one lesson. Raises UsageError if the file is not a lesson."""
     chip = read_vessel_case(path)
     with np.load(path, allow_pickle=False) as data:
         if "assumed_walls" not in data.files:

@@ -52,9 +52,7 @@ class _Lateness:
 class ClockMonitor:
     """Makes the Clocks messages of a run.
 
-    Parameters
-    ----------
-    read : returns monotonic and wall clock, ns.
+    `read`: returns monotonic and wall clock, ns.
     """
 
     def __init__(self, read: Callable[[], tuple[int, int]] = read_clocks) -> None:

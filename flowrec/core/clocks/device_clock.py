@@ -157,9 +157,7 @@ def _advance(fit: Fit, device: int, point: Point) -> Fit:
             if judged is not None:
                 return judged
             fit = replace(
-                fit,
-                first_points=(point,),
-                suspected_unit=(early[-1][1] - early[0][1]) / (early[-1][0] - early[0][0]),
+                fit, first_points=(point,), suspected_unit=(early[-1][1] - early[0][1]) / (early[-1][0] - early[0][0])
             )
         if early_ns > nanoseconds(_EARLY_S):
             # The clock seems to count faster than stated; wait for the measurement.
@@ -245,15 +243,8 @@ def _unwrap(fit: Fit, device: int, arrival_ns: int, wrap: int) -> tuple[int, int
 def envelope(points: tuple[Point, ...]) -> tuple[Point, float]:
     """The line below all points and nearest to them: one of its points, and its rate.
 
-    The sum of the distances is smallest for the edge of the lower convex hull that contains the points' mean.
-
-    Parameters
-    ----------
-    points : in order of device time.
-
-    Raises
-    ------
-    ValueError : fewer than two different points.
+    The sum of the distances is smallest for the edge of the lower convex hull that contains the points' mean. `points`:
+    in order of device time. Raises ValueError: fewer than two different points.
     """
     hull: list[Point] = []
     for x, y in points:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.core.declarations import NOT_STATED, Matrix, Message, Raster, Shape, Vector, message_fields
-from flowrec.core.errors import UsageError
+from flowrec.core.errors import UsageError, needs
 from flowrec.core.units import seconds, unit_of
 
 if TYPE_CHECKING:
@@ -135,12 +135,8 @@ class FlowField(Message):
         ------
         UsageError : xarray is not installed.
         """
-        try:
+        with needs("to_xarray", "export"):
             import xarray as xr
-        except ModuleNotFoundError as error:
-            raise UsageError(
-                f"to_xarray needs {error.name}, which is not installed: pip install 'flowrec[export]'"
-            ) from error
         meanings = {each.name: each.meaning for each in message_fields(type(self))}
         variables = {
             name: (
@@ -169,10 +165,8 @@ class FlowField(Message):
 
     def to_pandas(self) -> pandas.DataFrame:
         """The columns VALUES with a row for each pixel of fluid; UsageError if pandas is not installed."""
-        try:
+        with needs("to_pandas", "export"):
             import pandas
-        except ModuleNotFoundError as error:
-            raise UsageError("to_pandas needs pandas, which is not installed: pip install 'flowrec[export]'") from error
         return pandas.DataFrame(values_of(self, fluid_of(self)), columns=list(VALUES))
 
     def plot(self, ax: Axes | None = None, show: Shown = "speed", path_um: ArrayLike | None = None) -> Axes:
@@ -189,12 +183,8 @@ class FlowField(Message):
         ------
         UsageError : Matplotlib is not installed, the method states no error, or the path has another shape.
         """
-        try:
+        with needs("plot", "report"):
             import matplotlib.pyplot as plt
-        except ModuleNotFoundError as error:
-            raise UsageError(
-                f"plot needs {error.name}, which is not installed: pip install 'flowrec[report]'"
-            ) from error
         if show not in ("speed", "error"):
             raise UsageError(f"show = {show!r}: must be 'speed' or 'error'")
         if show == "error" and self.std_um_s is None:

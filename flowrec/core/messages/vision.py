@@ -23,9 +23,7 @@ class Track(Message):
         None
     )
     velocity_px_s: Annotated[
-        Vector,
-        Shape("n"),
-        "mean velocity (2,) of a robot that is tracked by its learned appearance; (0,): none",
+        Vector, Shape("n"), "mean velocity (2,) of a robot that is tracked by its learned appearance; (0,): none"
     ] = NOT_STATED
     spread_px: Annotated[float, "mean distance from where it was expected"] = 0.0
     energy: Annotated[float, "mean of its squared foreground, in units of the noise's variance"] = 0.0

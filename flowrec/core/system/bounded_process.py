@@ -53,9 +53,7 @@ class BoundedProcess:
     def call(self, function: Callable[..., Answer], *given: Any) -> Answer:
         """The result of a function of a module, called in the child.
 
-        Raises
-        ------
-        FlowrecError : that of the function; or `error`, where it raised another, or went beyond a limit.
+        Raises FlowrecError: that of the function; or `error`, where it raised another, or went beyond a limit.
         """
         child = self._child = self._child or self._start_child()
         try:

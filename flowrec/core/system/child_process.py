@@ -38,26 +38,16 @@ class ChildEndedError(Exception):
 class ChildProcess:
     """The process, as its parent sees it; it ends with `close`, or with the parent.
 
-    Parameters
-    ----------
-    inherited : file descriptors that it gets, too.
+    `inherited`: file descriptors that it gets, too. Raises OSError: it does not start.
 
     Attributes
     ----------
     process : that of the system.
     printed : the last part of what it has printed.
-
-    Raises
-    ------
-    OSError : it does not start.
     """
 
     def __init__(
-        self,
-        module: str,
-        *words: str,
-        environment: Mapping[str, str] | None = None,
-        inherited: Sequence[int] = (),
+        self, module: str, *words: str, environment: Mapping[str, str] | None = None, inherited: Sequence[int] = ()
     ) -> None:
         self.process = start_child(module, *words, environment=environment, stderr=subprocess.PIPE, pass_fds=inherited)
         self.printed = b""

@@ -24,11 +24,7 @@ def append_line(path: Path, line: bytes) -> None:
     """Write a line behind the others; a file that is not there is made.
 
     Where the last line has no end, because the power failed, the new one begins on a line of its own. Several processes
-    may append to one file.
-
-    Raises
-    ------
-    OSError : it can not be written; the file is as it was before.
+    may append to one file. Raises OSError: it can not be written; the file is as it was before.
     """
     with _open_locked(path) as descriptor:
         size = os.fstat(descriptor).st_size
@@ -70,16 +66,8 @@ def replacing(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
     """Yield a new file in the same folder; it gets the name `path` when the block ends without an exception.
 
     If the block ends with an exception, the new file is removed and `path` is as it was before. Files that killed
-    processes have left in the folder are removed, too.
-
-    Parameters
-    ----------
-    overwrite : a file of that name may be replaced, whatever it holds.
-
-    Raises
-    ------
-    FileExistsError : there is one, and `overwrite` is not set.
-    OSError : it can not be written.
+    processes have left in the folder are removed, too. `overwrite`: a file of that name may be replaced, whatever it
+    holds. Raises FileExistsError: there is one, and `overwrite` is not set; OSError: it can not be written.
     """
     part = path.with_name(temporary_name(path.suffix))
     remove_leftovers_once(part.absolute().parent)
@@ -102,10 +90,8 @@ def write_all(descriptor: int, data: bytes) -> None:
 def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:
     """Rename a finished file to its final name in one step, and flush the name to the disk.
 
-    Raises
-    ------
-    FileExistsError : another file has the name by now, and `overwrite` is not set.
-    OSError : the name can not be given.
+    Raises FileExistsError: another file has the name by now, and `overwrite` is not set; OSError: the name can not be
+    given.
     """
     if overwrite:
         part.replace(path)

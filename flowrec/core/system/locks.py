@@ -31,9 +31,7 @@ _WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)  # what such a 
 def open_new(path: Path, *, overwrite: bool = False) -> FileIO:
     """Make a file that this process alone writes; nothing is ever truncated.
 
-    Parameters
-    ----------
-    overwrite : remove a file of that name first, which no living process may be writing.
+    `overwrite`: remove a file of that name first, which no living process may be writing.
 
     Raises
     ------
@@ -66,10 +64,7 @@ def open_new(path: Path, *, overwrite: bool = False) -> FileIO:
 def remove_idle(path: Path) -> None:
     """Remove a file, unless a living process writes it.
 
-    Raises
-    ------
-    BlockingIOError : a living process writes it.
-    OSError : it can not be opened, locked or removed.
+    Raises BlockingIOError: a living process writes it; OSError: it can not be opened, locked or removed.
     """
     try:
         file = FileIO(path, "r+")
@@ -86,9 +81,7 @@ def remove_idle(path: Path) -> None:
 def hold_file(path: Path) -> Iterator[None]:
     """Keep every other process from writing, recovering or removing a file; a file that can not be opened is not held.
 
-    Raises
-    ------
-    BlockingIOError : another process writes or holds it.
+    Raises BlockingIOError: another process writes or holds it.
     """
     with contextlib.ExitStack() as stack:
         try:
@@ -113,9 +106,7 @@ def is_growing(path: Path) -> bool:
 def try_lock(descriptor: int, *, exclusive: bool) -> bool:
     """Try to lock an open file or directory; False if another process has a lock that excludes this one.
 
-    Raises
-    ------
-    OSError : the file can not be locked.
+    Raises OSError: the file can not be locked.
     """
     if sys.platform != "win32" and HAS_LOCKS:
         try:
@@ -131,13 +122,8 @@ def try_lock(descriptor: int, *, exclusive: bool) -> bool:
 def take_lock(descriptor: int, *, from_writer: bool = False) -> None:
     """Take the exclusive lock of an open file, when those have let go that hold it for moments.
 
-    Parameters
-    ----------
-    from_writer : whoever holds it exclusively is waited for, too.
-
-    Raises
-    ------
-    BlockingIOError : another process writes the file, or has held the lock for two seconds.
+    `from_writer`: whoever holds it exclusively is waited for, too. Raises BlockingIOError: another process writes the
+    file, or has held the lock for two seconds.
     """
     end_s = time.monotonic() + _TIMEOUT_S
     while not try_lock(descriptor, exclusive=True):

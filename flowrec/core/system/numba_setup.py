@@ -48,9 +48,7 @@ def compiled(function: Function) -> Function:
 class Kernel:
     """A function that numba compiles, also where another kernel calls it.
 
-    Attributes
-    ----------
-    py_func : the function in Python.
+    `py_func`: the function in Python.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -29,28 +29,19 @@ class OutputFolder:
     An existing folder is replaced if it is an earlier output with the same `facts` in which nothing was changed; with
     `overwrite` if it is an output of flowrec at all. A folder with a file that flowrec did not write into it always
     stays as it is.
-
-    Attributes
-    ----------
-    path : of the folder.
-    facts : what it is made from; kept in its marker.
-    suffixes : that the name must end in, the usual one first; "" allows any name.
-    inputs : files that the command reads; the folder must contain none of them.
-    overwrite : a folder with other facts, or with files that were changed, may be replaced.
     """
 
-    path: Path
-    facts: Mapping[str, str]
-    suffixes: tuple[str, ...] = ("",)
-    inputs: tuple[Path, ...] = ()
+    path: Path  # of the folder
+    facts: Mapping[str, str]  # what it is made from; kept in its marker
+    suffixes: tuple[str, ...] = ("",)  # that the name must end in, the usual one first; "" allows any name
+    inputs: tuple[Path, ...] = ()  # files that the command reads; the folder must contain none of them
+    # a folder with other facts, or with files that were changed, may be replaced
     overwrite: bool = field(default=False)
 
     def check(self) -> None:
         """Check the output before any work is done for it.
 
-        Raises
-        ------
-        OutputError : it may not be written; the text says why, and what to do.
+        Raises OutputError: it may not be written; the text says why, and what to do.
         """
         path, parent = self.path, self.path.absolute().parent
         if not path.name.endswith(self.suffixes):
@@ -69,12 +60,8 @@ class OutputFolder:
     def new_folder(self) -> Iterator[Path]:
         """Yield a temporary empty folder beside `path`; it gets that name when the block ends without an exception.
 
-        If the block ends with an exception, nothing is left and an existing folder is as before.
-
-        Raises
-        ------
-        OutputError : the output is refused, see `check`.
-        SessionError : it can not be written, in one line.
+        If the block ends with an exception, nothing is left and an existing folder is as before. Raises OutputError:
+        the output is refused, see `check`; SessionError: it can not be written, in one line.
         """
         self.check()
         path = self.path.absolute()

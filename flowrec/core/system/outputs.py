@@ -43,33 +43,20 @@ class OutputError(SessionError):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """An output file of a verb, and what it may replace.
+    """An output file of a verb, and what it may replace."""
 
-    Attributes
-    ----------
-    path : of the file.
-    suffixes : those of its format, the usual one first.
-    inputs : files that the command reads; the output must be none of them, even with `overwrite`.
-    overwrite : an existing file may be replaced.
-    replaces : SHA-256 of what flowrec wrote there before; a file that still holds it may be replaced, too.
-    """
-
-    path: Path
-    suffixes: tuple[str, ...]
+    path: Path  # of the file
+    suffixes: tuple[str, ...]  # those of its format, the usual one first
+    # files that the command reads; the output must be none of them, even with `overwrite`
     inputs: tuple[Path, ...] = ()
-    overwrite: bool = False
-    replaces: str = ""
+    overwrite: bool = False  # an existing file may be replaced
+    replaces: str = ""  # SHA-256 of what flowrec wrote there before; a file that still holds it may be replaced, too
 
     def check(self, also: Iterable[Path] = ()) -> None:
         """Check the output before any work is done for it.
 
-        Parameters
-        ----------
-        also : other files that this output replaces or adds to: the parts of a session, and its unfinished files.
-
-        Raises
-        ------
-        OutputError : it may not be written; the text says why, and what to do.
+        `also`: other files that this output replaces or adds to: the parts of a session, and its unfinished files.
+        Raises OutputError: it may not be written; the text says why, and what to do.
         """
         path, suffixes, files = self.path, self.suffixes, (self.path, *also)
         if path.is_dir():
@@ -98,12 +85,8 @@ class Output:
     def new_file(self) -> Iterator[Path]:
         """Yield a temporary file in the same folder; it gets the name `path` when the block ends without an exception.
 
-        If the block ends with an exception, nothing is left.
-
-        Raises
-        ------
-        OutputError : the output is refused, see `check`.
-        SessionError : it can not be written, in one line.
+        If the block ends with an exception, nothing is left. Raises OutputError: the output is refused, see `check`;
+        SessionError: it can not be written, in one line.
         """
         self.check()
         path = self.path

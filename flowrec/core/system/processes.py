@@ -52,14 +52,12 @@ def start_child(
 ) -> subprocess.Popen[bytes]:
     """Start a module of flowrec as a program in a session of its own: what ends the child is its parent, not Ctrl-C.
 
+    Raises OSError: it does not start.
+
     Parameters
     ----------
     environment : variables besides those of every child.
     given : as of subprocess.Popen; by default there are pipes to and from the child.
-
-    Raises
-    ------
-    OSError : it does not start.
     """
     process: subprocess.Popen[Any] = subprocess.Popen(  # noqa: S603 - our own module
         child_command(module, *words),

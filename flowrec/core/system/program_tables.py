@@ -38,9 +38,7 @@ def program_of(head: bytes) -> str:
 def program_rows(path: Path, program: str) -> _Rows:
     """Header and rows of the table in a file, each with its number from 1.
 
-    Raises
-    ------
-    UsageError : one line: a missing package, a damaged file, no table in it.
+    Raises UsageError: one line: a missing package, a damaged file, no table in it.
     """
     reads, package = _READERS[program]
     if importlib.util.find_spec(package) is None:

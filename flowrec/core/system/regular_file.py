@@ -41,9 +41,7 @@ def refuse_irregular(path: Path, error: type[FlowrecError] = UsageError) -> None
 def make_own_folder(folder: Path) -> None:
     """Make a folder in which no other user can write, with its parents; it may be there already.
 
-    Raises
-    ------
-    OSError : it can not be made, or belongs to another user, or others can write in it.
+    Raises OSError: it can not be made, or belongs to another user, or others can write in it.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = folder.lstat()

@@ -30,6 +30,8 @@ _LARGE_BYTES = 1 << 16  # numpy copies larger parts without the interpreter's lo
 class SharedRing:
     """One end of the ring; `put` belongs to one process, `take` and `release` to the other.
 
+    Raises OSError: the system has not so much memory.
+
     Parameters
     ----------
     nbytes : room for records; each takes at most 15 bytes more than its parts. Any record of less than half of it
@@ -41,10 +43,6 @@ class SharedRing:
     ----------
     handle : to be inherited by the other process: a file descriptor, on Windows (untested) a name.
     words : `WORDS` numbers of 64 bit, all 0 at first.
-
-    Raises
-    ------
-    OSError : the system has not so much memory.
     """
 
     def __init__(self, nbytes: int, touched: bool = False, handle: str | None = None) -> None:

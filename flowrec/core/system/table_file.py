@@ -37,29 +37,18 @@ _EXCEL_S, _EXCEL_S_PER_MB = 20.0, 20.0  # CPU time; openpyxl takes some 3 s for 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """A table; cells are text or, of an Excel file, numbers.
+    """A table; cells are text or, of an Excel file, numbers."""
 
-    Attributes
-    ----------
-    where : the file, for messages.
-    header : names of the columns, as written.
-    rows : cells of each row, as many as the header has.
-    lines : (n,) line of the file, or row of the sheet, of each row.
-    decimal_comma : numbers are written as 1,5.
-    """
-
-    where: str
-    header: tuple[str, ...]
-    rows: list[list[Any]]
-    lines: list[int]
-    decimal_comma: bool = False
+    where: str  # the file, for messages
+    header: tuple[str, ...]  # names of the columns, as written
+    rows: list[list[Any]]  # cells of each row, as many as the header has
+    lines: list[int]  # (n,) line of the file, or row of the sheet, of each row
+    decimal_comma: bool = False  # numbers are written as 1,5
 
     def index(self, name: str) -> int | None:
         """Place of a column by its name, or else by its name in another spelling; None: there is none.
 
-        Raises
-        ------
-        UsageError : there are two.
+        Raises UsageError: there are two.
         """
         places = [n for n, given in enumerate(self.header) if given == name.strip()]
         if not places:
@@ -71,9 +60,7 @@ class Table:
     def numbers(self, name: str) -> NDArray[np.float64]:
         """(n,) the numbers of a column.
 
-        Raises
-        ------
-        UsageError : no such column; an empty cell, NaN, or what is no number, with its line.
+        Raises UsageError: no such column; an empty cell, NaN, or what is no number, with its line.
         """
         return self._values(name, dates=False)
 
@@ -81,14 +68,8 @@ class Table:
         """The column of times, and its times (n,) in s. None: there is none.
 
         Dates (ISO 8601, or of Excel) count from 1970 in UTC, unless they state an offset; times of day from midnight.
-
-        Parameters
-        ----------
-        name : of the column, in s or dates; None: the first of TIME_UNITS that there is, or DATES.
-
-        Raises
-        ------
-        UsageError : as `numbers`.
+        `name`: of the column, in s or dates; None: the first of TIME_UNITS that there is, or DATES. Raises UsageError:
+        as `numbers`.
         """
         known = (name,) if name is not None else (*TIME_UNITS, DATES)
         found = next((each for each in known if self.index(each) is not None), None)
@@ -171,9 +152,7 @@ def _not_a_number(cell: Any, *, only_dates: bool) -> str:
 def read_table(path: Path) -> Table:
     """Read a table. Lines that begin with # and empty ones are passed over; the first of the others is the header.
 
-    Raises
-    ------
-    UsageError : one line: no such file, no table, rows of unequal length, or a missing package.
+    Raises UsageError: one line: no such file, no table, rows of unequal length, or a missing package.
     """
     refuse_irregular(path)
     try:

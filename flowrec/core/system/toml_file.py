@@ -55,12 +55,7 @@ def _refuse_long(value: Any) -> None:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a configuration.
-
-    Raises
-    ------
-    UsageError : there is no such file, it can not be read, or is no TOML.
-    """
+    """The tables of a configuration. Raises UsageError: there is no such file, it can not be read, or is no TOML."""
     begin = "flowrec record --dry-run > my.toml writes one to begin with"
     kind = _NOT_TOML.get(path.suffix.lower())
     if kind is not None:

@@ -72,7 +72,7 @@ class MotionFigure:
         demanded = "the speed through the fluid that the controller demands, " if _has_demand(data) else ""
         parts = [
             f"Above: speed of the robot over ground, {demanded}and the speed of the flow at the robot, as the observer "
-            "estimates it.",
+            "estimates it."
         ]
         if data.history.curve("error_um"):
             parts.append("Below: distance of the robot to the point of its route where it should be at that time.")

@@ -46,18 +46,12 @@ _SHOWN = (  # fields of a tick, in the order in which they are taken
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """An event of the run, or an action of the operator.
-
-    Attributes
-    ----------
-    level : enums.Level of an event, '' of an action.
-    action : enums.Action of an action, '' of an event.
-    """
+    """An event of the run, or an action of the operator."""
 
     time_s: float
     text: str
-    level: str = ""
-    action: str = ""
+    level: str = ""  # enums.Level of an event, '' of an action
+    action: str = ""  # enums.Action of an action, '' of an event
 
 
 class History:
@@ -104,9 +98,7 @@ class History:
     def of(cls, session: Session, progress: TimeProgress = lambda _: None) -> History:
         """Read a session; `progress` takes the session time in s since the first tick.
 
-        Raises
-        ------
-        SessionError : a message is damaged.
+        Raises SessionError: a message is damaged.
         """
         first_ns = session.run.first_ns
         history = cls(first_ns, first_ns + nanoseconds(session.duration_s))

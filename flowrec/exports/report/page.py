@@ -17,16 +17,10 @@ _TEMPLATES = {"Page": "page.html", "SweepPage": "sweep.html"}  # by the class of
 
 
 class ReportFigure(Protocol):
-    """A figure of a report.
+    """A figure of a report."""
 
-    Attributes
-    ----------
-    name : of its files, without a suffix.
-    title : its heading.
-    """
-
-    name: str
-    title: str
+    name: str  # of its files, without a suffix
+    title: str  # its heading
 
     def why_not(self, data: ReportData) -> str:
         """Reason why it can not be drawn of this session, as words after a colon; '' if it can."""

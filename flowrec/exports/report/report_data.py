@@ -21,17 +21,11 @@ _DARKEST, _BRIGHTEST = 0.5, 99.5  # percentiles of the grey levels that become b
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraImage:
-    """Median of several camera images, at a reduced size.
+    """Median of several camera images, at a reduced size."""
 
-    Attributes
-    ----------
-    image : (h, w) uint8, every `step`-th row and column of the camera's image.
-    images : number of images of which it is the median.
-    """
-
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  # (h, w) uint8, every `step`-th row and column of the camera's image
     step: int
-    images: int
+    images: int  # number of images of which it is the median
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,9 +41,7 @@ class ReportData:
     def of(cls, session: Session, progress: TimeProgress = lambda _: None) -> ReportData:
         """Read a session; `progress` takes the session time in s since the first tick.
 
-        Raises
-        ------
-        FlowrecError : header, chip or a message is not valid.
+        Raises FlowrecError: header, chip or a message is not valid.
         """
         config = session.config
         size_px = (config.camera.width_px, config.camera.height_px)

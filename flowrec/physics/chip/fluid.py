@@ -227,10 +227,7 @@ def blood() -> CarreauYasuda:
 def from_function(function: str) -> TabulatedLaw:
     """The table of a user's function "module:name" from shear rates (m,) in 1/s to viscosities (m,) over the chip's.
 
-    Raises
-    ------
-    ChipError
-        If there is no such function, it fails, or does not return a positive number per shear rate.
+    Raises ChipError if there is no such function, it fails, or does not return a positive number per shear rate.
     """
     module, _, name = function.partition(":")
     what = f"chip.viscosity.function = {function!r}"

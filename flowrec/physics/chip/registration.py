@@ -126,16 +126,10 @@ _NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Orientation:
-    """One of ORIENTATIONS.
+    """One of ORIENTATIONS."""
 
-    Attributes
-    ----------
-    turned_deg : 0, 90, 180 or 270, from right to down (clockwise as seen).
-    mirrored : y is reversed before the turn.
-    """
-
-    turned_deg: int
-    mirrored: bool
+    turned_deg: int  # 0, 90, 180 or 270, from right to down (clockwise as seen)
+    mirrored: bool  # y is reversed before the turn
 
     @property
     def name(self) -> str:

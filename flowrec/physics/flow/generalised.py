@@ -148,12 +148,8 @@ class GeneralisedSystem(Equations):
         """Fluxes (faces,) of the steady flow for inertia = rho h / mu in s/m.
 
         Newton's method starts from the Newtonian Stokes flow. Where it fails, continuation follows flows of increasing
-        strength of the law and increasing inertia.
-
-        Raises
-        ------
-        NotConvergedError
-            If the last step is not below `tolerance`, or ENOUGH, of the fastest velocity after `max_iterations`.
+        strength of the law and increasing inertia. Raises NotConvergedError if the last step is not below `tolerance`,
+        or ENOUGH, of the fastest velocity after `max_iterations`.
         """
         flux = self.linear(drive, push)
         if not flux.any():
@@ -166,13 +162,7 @@ class GeneralisedSystem(Equations):
         )
 
     def newton(
-        self,
-        flux: Floats,
-        drive: Floats,
-        push: Floats | float,
-        inertia: float,
-        max_iterations: int,
-        tolerance: float,
+        self, flux: Floats, drive: Floats, push: Floats | float, inertia: float, max_iterations: int, tolerance: float
     ) -> tuple[Floats | None, int, float]:
         """Flux, or None where the iteration diverges or is slow; number of iterations; last relative step.
 

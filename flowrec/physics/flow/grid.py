@@ -114,10 +114,7 @@ def _parabola(low: Floats, high: Floats) -> Floats:
 def build(chip: Chip, k: int, walls: LevelSet | None = None) -> Grid:
     """Number the faces and cells of a chip. `walls` replaces those of the mask.
 
-    Raises
-    ------
-    FlowError
-        If the pixels of an opening are not one run of fluid.
+    Raises FlowError if the pixels of an opening are not one run of fluid.
     """
     if walls is None:
         drawn = chip.mask if chip.drawn is None else chip.drawn

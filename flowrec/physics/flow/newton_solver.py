@@ -57,10 +57,7 @@ class Continuation:
     def follow(self, solve: Solve, flux: Floats, end: float, max_iterations: int, tolerance: float) -> Floats:
         """Flow (faces,) of the parameter `end`, from that of 0.
 
-        Raises
-        ------
-        NotConvergedError
-            If there is no flow of `end` after all iterations.
+        Raises NotConvergedError if there is no flow of `end` after all iterations.
         """
         left, reached, stride = max_iterations, 0.0, end
         while True:
@@ -183,11 +180,8 @@ class System(Equations):
         """Navier-Stokes fluxes (faces,) for inertia = rho h / mu in s/m.
 
         Newton's method starts from Stokes flow. Where it fails, continuation follows flows of increasing inertia.
-
-        Raises
-        ------
-        NotConvergedError
-            If the step is not below `tolerance` of the fastest velocity after `max_iterations`, continuation included.
+        Raises NotConvergedError if the step is not below `tolerance` of the fastest velocity after `max_iterations`,
+        continuation included.
         """
         flux = self.linear(drive, push)
         if inertia == 0.0 or not flux.any():
@@ -198,13 +192,7 @@ class System(Equations):
         )
 
     def _newton(
-        self,
-        flux: Floats,
-        drive: Floats,
-        push: Floats | float,
-        inertia: float,
-        max_iterations: int,
-        tolerance: float,
+        self, flux: Floats, drive: Floats, push: Floats | float, inertia: float, max_iterations: int, tolerance: float
     ) -> tuple[Floats | None, int, float]:
         """Flux, or None where the iteration diverges or is slow; number of iterations; last relative step.
 

@@ -99,12 +99,8 @@ class FieldError:
 def relative_rmse(field: FlowField, truth: FlowField, mask: Bools) -> FieldError:
     """sqrt(sum |v - v*|^2 / sum |v*|^2) at the centres of the fluid pixels of a mask (h, w): Table I of the paper.
 
-    Both sums are over points, so both fields must hold values at pixel centres. A true field at rest gives NaN.
-
-    Raises
-    ------
-    FlowError
-        If the two fields have different sizes.
+    Both sums are over points, so both fields must hold values at pixel centres. A true field at rest gives NaN. Raises
+    FlowError if the two fields have different sizes.
     """
     if field.velocity_um_s.shape != truth.velocity_um_s.shape:
         raise FlowError(

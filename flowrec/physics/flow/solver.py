@@ -36,10 +36,7 @@ class FlowSolver:
     def solve(self, chip: Chip) -> FlowField:
         """Flow on the pixels of the chip's mask for its boundary values; stamp and request are 0.
 
-        Raises
-        ------
-        FlowError
-            If the openings can not carry a flow, or convection does not converge.
+        Raises FlowError if the openings can not carry a flow, or convection does not converge.
         """
         self._check(chip)
         if chip.is_driven:

@@ -29,10 +29,7 @@ class StreamBasis:
 def assemble(grid: Grid) -> StreamBasis:
     """Basis of the divergence-free flows of a grid that satisfy walls and inlets.
 
-    Raises
-    ------
-    FlowError
-        If a part of the fluid has inlets only.
+    Raises FlowError if a part of the fluid has inlets only.
     """
     h, w = grid.fluid.shape
     corner = np.arange((h + 1) * (w + 1)).reshape(h + 1, w + 1)

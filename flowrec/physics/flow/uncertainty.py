@@ -16,16 +16,10 @@ from flowrec.core import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Doubts:
-    """Alternatives in one place: k changes of the flow that exclude each other.
+    """Alternatives in one place: k changes of the flow that exclude each other."""
 
-    Attributes
-    ----------
-    changes_um_s : (k, n, 2) of the flow.
-    probability : (k,) of each; what is left to 1 is that of no change.
-    """
-
-    changes_um_s: NDArray[np.floating]
-    probability: Floats
+    changes_um_s: NDArray[np.floating]  # (k, n, 2) of the flow
+    probability: Floats  # (k,) of each; what is left to 1 is that of no change
 
     @classmethod
     def none(cls, pixels: int) -> Doubts:
@@ -35,20 +29,12 @@ class Doubts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Chip point of a measured point x: x + offset - scale (x - c) - angle J (x - c); J turns from +x to +y.
+    """Chip point of a measured point x: x + offset - scale (x - c) - angle J (x - c); J turns from +x to +y."""
 
-    Attributes
-    ----------
-    offset_um : (2,).
-    scale : relative error of um per pixel.
-    angle_rad : from +x to +y.
-    centre_um : (2,) c.
-    """
-
-    offset_um: Floats
-    scale: float
-    angle_rad: float
-    centre_um: Floats
+    offset_um: Floats  # (2,)
+    scale: float  # relative error of um per pixel
+    angle_rad: float  # from +x to +y
+    centre_um: Floats  # (2,) c
 
     @classmethod
     def identity(cls) -> Registration:
@@ -81,28 +67,20 @@ class FlowUncertainty:
 
     The first p unknowns are those of the flow. The last r are constants of the robot: each adds to an *observed* flow
     a multiple of the robot's own velocity through the fluid, and nothing to the flow itself.
-
-    Attributes
-    ----------
-    mean_um_s : (n, 2) the most probable flow.
-    columns_um_s : (p, n, 2) per unit of each unknown of the flow.
-    rolled : (r, n) ratio of what a unit of each constant of the robot adds to an observed flow to its own velocity;
-        1 everywhere for the relative error of um per revolution.
-    covariance : (p + r, p + r) of all unknowns.
-    error_um_s : (n,) standard deviation of a component that no unknown explains.
-    noise_factor : by which the noise of observations was wider than stated, neighbours that err alike included.
-    doubts : what may be wrong in one place; neither `std_um_s` nor `error_share` contains it.
-    registration : the most probable one.
     """
 
-    mean_um_s: Floats
-    columns_um_s: Floats
+    mean_um_s: Floats  # (n, 2) the most probable flow
+    columns_um_s: Floats  # (p, n, 2) per unit of each unknown of the flow
+    # (r, n) ratio of what a unit of each constant of the robot adds to an observed flow to its own velocity; 1
+    # everywhere for the relative error of um per revolution
     rolled: Floats
-    covariance: Floats
-    error_um_s: Floats
+    covariance: Floats  # (p + r, p + r) of all unknowns
+    error_um_s: Floats  # (n,) standard deviation of a component that no unknown explains
+    # by which the noise of observations was wider than stated, neighbours that err alike included
     noise_factor: float = 1.0
+    # what may be wrong in one place; neither `std_um_s` nor `error_share` contains it
     doubts: Doubts = field(default_factory=lambda: Doubts.none(0))
-    registration: Registration = field(default_factory=Registration.identity)
+    registration: Registration = field(default_factory=Registration.identity)  # the most probable one
 
     @property
     def std_um_s(self) -> Floats:

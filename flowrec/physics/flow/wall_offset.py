@@ -19,10 +19,7 @@ from flowrec.physics.flow.level_set import CLEARANCE_PX, from_mask
 def with_wall_offset(chip: Chip, offset_px: float) -> Chip:
     """The chip with all walls moved outwards from where it has them, at the same flow rates through its inlets.
 
-    Raises
-    ------
-    FlowError
-        If an opening closes, or two meet.
+    Raises FlowError if an opening closes, or two meet.
     """
     if offset_px == 0.0:
         return chip

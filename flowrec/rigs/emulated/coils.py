@@ -33,18 +33,11 @@ _SAID = 300  # letters of what a compiler prints
 
 @dataclass(frozen=True)
 class OutputSamples:
-    """A file of samples of the outputs, which grows.
+    """A file of samples of the outputs, which grows."""
 
-    Attributes
-    ----------
-    file : records of `sample`, one for each change of the outputs.
-    a_per_unit : current of a coil in A for one unit in the file.
-    coils : their number.
-    """
-
-    file: Path
-    a_per_unit: float = FULL_A
-    coils: int = 3
+    file: Path  # records of `sample`, one for each change of the outputs
+    a_per_unit: float = FULL_A  # current of a coil in A for one unit in the file
+    coils: int = 3  # their number
 
     @property
     def sample_bytes(self) -> int:
@@ -86,11 +79,8 @@ def compiler() -> str | None:
 def compiled_firmware(folder: Path, timer_ms: int = 100, coils: int = 3, *, sensors: bool = False) -> Path:
     """The board as a program in a folder, where it is kept. With `timer_ms` = 0 it does not go to zero by itself.
 
-    Boards have 3 or 6 coils, and with `sensors` they measure their currents.
-
-    Raises
-    ------
-    RigError : there is no compiler, or it refuses.
+    Boards have 3 or 6 coils, and with `sensors` they measure their currents. Raises RigError: there is no compiler, or
+    it refuses.
     """
     program = folder / f"board{timer_ms}_{coils}_{sensors}"
     if program.exists():

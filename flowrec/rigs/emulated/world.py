@@ -14,17 +14,7 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import (
-    NS_PER_S,
-    FlowField,
-    Image,
-    Priority,
-    RigError,
-    Truth,
-    nanoseconds,
-    realtime_priority,
-    seconds,
-)
+from flowrec.core import NS_PER_S, FlowField, Image, Priority, RigError, Truth, nanoseconds, realtime_priority, seconds
 from flowrec.rigs.emulated.coils import OutputSamples
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.rig import SimulatedRig
@@ -135,15 +125,13 @@ def emulated_world(
 ) -> Iterator[tuple[EmulatedWorld, list[Truth]]]:
     """The world while it runs, from its first image on; yields it, and the truth of its images so far.
 
+    Raises RigError: it has not begun.
+
     Parameters
     ----------
     show : takes each image.
     camera_delay_s : from the end of an exposure to `show`; an image that is made later is shown at once.
     again_after_s : see EmulatedWorld; the truth is then not kept, because the world may run for days.
-
-    Raises
-    ------
-    RigError : it has not begun.
     """
     world = EmulatedWorld.of(pipeline, config)
     world.rolled = Rolled(samples, np.array(config.coils.mt_per_a))

@@ -34,14 +34,8 @@ def with_exported(asked: Config) -> tuple[Config, list[str]]:
     """The configuration with what the movie or its log tell of the session that they were exported from.
 
     Settings that are given stay: those that differ from their defaults, of the camera also those of a registration.
-
-    Returns
-    -------
-    The configuration, and the settings that were taken, such as "robot.um_per_rev = 30".
-
-    Raises
-    ------
-    MovieError : the movie can not be read, or what flowrec wrote is damaged.
+    Raises MovieError: the movie can not be read, or what flowrec wrote is damaged. Returns the configuration, and the
+    settings that were taken, such as "robot.um_per_rev = 30".
     """
     with open_source(asked.movie) as movie:
         facts = movie.facts

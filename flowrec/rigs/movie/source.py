@@ -89,9 +89,7 @@ class MovieSource:
     def frames(self) -> Iterator[Frame]:
         """The images with their stamps and numbers, in order.
 
-        Raises
-        ------
-        MovieError : in one line: an image that can not be decoded, or a time that is not after the one before.
+        Raises MovieError: in one line: an image that can not be decoded, or a time that is not after the one before.
         """
         before, count = -1, 0
         for image in self._movie.frames():

@@ -34,11 +34,7 @@ Mask = NDArray[np.bool_]
 
 
 def true_walls(
-    chip: Chip,
-    wall_error_px: float,
-    blocked_share: float,
-    clear_um: NDArray[np.float64],
-    rng: np.random.Generator,
+    chip: Chip, wall_error_px: float, blocked_share: float, clear_um: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[Chip, str]:
     """The chip with a mask (c h, c w) of its true walls, c = 2 or for large chips 1, and what was drawn, in words.
 
@@ -118,12 +114,7 @@ def _specks(inside: Mask, before: Mask, neighbours: NDArray[np.float64] | None) 
 
 
 def _obstacle(
-    true: Chip,
-    origin: float,
-    share: float,
-    channel: float,
-    clear_um: NDArray[np.float64],
-    rng: np.random.Generator,
+    true: Chip, origin: float, share: float, channel: float, clear_um: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[Mask, tuple[float, float]]:
     """The pixels of half an ellipse on one wall of a branch, and the place in um; `channel` is a width in pixels."""
     fluid = true.mask

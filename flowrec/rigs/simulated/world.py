@@ -203,11 +203,7 @@ class World:
 
 
 def world_of(
-    chip: Chip,
-    robot: Robot,
-    simulated: Simulated,
-    field: FlowField | None,
-    clear_um: NDArray[np.float64],
+    chip: Chip, robot: Robot, simulated: Simulated, field: FlowField | None, clear_um: NDArray[np.float64]
 ) -> World:
     """The world of a seed. A given field keeps the chip's own walls.
 

@@ -23,51 +23,32 @@ class NoStreamError(RigError):
 
 @dataclass(frozen=True, slots=True)
 class StreamHead:
-    """Properties that a sender states.
+    """Properties that a sender states."""
 
-    Attributes
-    ----------
-    channels : names of the channels.
-    units : of each channel, '' where it is not stated.
-    rate_hz : of a regular stream; 0: samples come when they come.
-    sender : who sends, for people: program, machine.
-    """
-
-    channels: tuple[str, ...]
-    units: tuple[str, ...]
-    rate_hz: float = 0.0
-    sender: str = ""
+    channels: tuple[str, ...]  # names of the channels
+    units: tuple[str, ...]  # of each channel, '' where it is not stated
+    rate_hz: float = 0.0  # of a regular stream; 0: samples come when they come
+    sender: str = ""  # who sends, for people: program, machine
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Samples that came together.
+    """Samples that came together."""
 
-    Attributes
-    ----------
-    times_ns : (n,) when each was taken, on the host's monotonic clock; of a simulated stream on the session clock.
-    values : (n, c) all channels of each sample; or (n,) one value each, of the channels in `channel`.
-    arrival_ns : when they had come, on the same clock.
-    channel : (n,) places in `StreamHead.channels`, where `values` is (n,).
-    head : the head, if it has changed.
-    """
-
+    # (n,) when each was taken, on the host's monotonic clock; of a simulated stream on the session clock
     times_ns: Ints
-    values: Floats
-    arrival_ns: int
-    channel: NDArray[np.int32] | None = None
-    head: StreamHead | None = None
+    values: Floats  # (n, c) all channels of each sample; or (n,) one value each, of the channels in `channel`
+    arrival_ns: int  # when they had come, on the same clock
+    channel: NDArray[np.int32] | None = None  # (n,) places in `StreamHead.channels`, where `values` is (n,)
+    head: StreamHead | None = None  # the head, if it has changed
 
 
 class SampleStream(Protocol):
     """One stream. All methods are called in one thread at a time; `open` again after `close` looks for it anew.
 
     `of(name, settings)` of a row's class in STREAM_KINDS makes one of a section [streams.NAME]; nothing is touched
-    before `open`. Settings of a kind of another package are its `Settings`, section [streams.NAME.device].
-
-    Attributes
-    ----------
-    polled : the loop's own thread calls `read`, which never waits; else a thread of the stream does.
+    before `open`. Settings of a kind of another package are its `Settings`, section [streams.NAME.device]. `polled`:
+    the loop's own thread calls `read`, which never waits; else a thread of the stream does.
     """
 
     polled: ClassVar[bool] = False
@@ -84,9 +65,7 @@ class SampleStream(Protocol):
     def read(self, timeout_s: float) -> Chunk | None:
         """The samples that have come since the last call; None if there is none within the timeout.
 
-        Raises
-        ------
-        NoStreamError : the sender has ended.
+        Raises NoStreamError: the sender has ended.
         """
 
     def correction_s(self) -> float:
@@ -113,9 +92,7 @@ class SettableStream(Protocol):
 def named_channels(settings: StreamSettings, stated: list[str], count: int) -> tuple[str, ...]:
     """Names of the channels of a stream: those of the settings, else as the sender states them, else numbers.
 
-    Raises
-    ------
-    RigError : the settings name another number of channels.
+    Raises RigError: the settings name another number of channels.
     """
     given = settings.channels or tuple(name.strip() for name in stated)
     if settings.channels and len(given) != count:
@@ -127,9 +104,7 @@ def named_channels(settings: StreamSettings, stated: list[str], count: int) -> t
 def settings_of_device(kind: Any, given: dict[str, Any], where: str) -> Any:
     """The settings of a kind of another package, from the table of a configuration.
 
-    Raises
-    ------
-    UsageError : a key or a value that they do not have; one line.
+    Raises UsageError: a key or a value that they do not have; one line.
     """
     from pydantic import TypeAdapter, ValidationError
 

@@ -133,11 +133,8 @@ def shared_inverse(matrix: Floats, limits_of: Callable[[Floats], FieldLimits]) -
     maximum approximation, 1961). It stops as soon as the nominal amplitude is reached.
 
     The map is linear, so that a tick, the samples of a card and a firmware, which know a field only by its three
-    vectors, make the same currents, and bounds of current, voltage and slew hold between samples too.
-
-    Parameters
-    ----------
-    limits_of : the limits of a G.
+    vectors, make the same currents, and bounds of current, voltage and slew hold between samples too. `limits_of`: the
+    limits of a G.
     """
     least_norm: Floats = np.linalg.pinv(matrix).astype(np.float64)
     best = inverse = least_norm

@@ -183,13 +183,7 @@ class Coils:
     def check(self, where: str) -> None:
         """Refuse settings that are each within their range but together produce no field.
 
-        Parameters
-        ----------
-        where : origin of the settings, for the message.
-
-        Raises
-        ------
-        UsageError : one line, the key first.
+        `where`: origin of the settings, for the message. Raises UsageError: one line, the key first.
         """
         amplifier = self.amplifier
         self._check_counts(where)

@@ -183,8 +183,8 @@ class Controller:
 
         In the phases survey and navigate the reference runs along the route, from its start when the phase begins; in
         the others it is the position at which the phase found the robot. A finished mission demands nothing. While the
-        robot is held on its way, by the operator or because it is out of sight, the reference is the position where
-        the hold began; afterwards it continues along the route.
+        robot is held on its way, by the operator or because it is out of sight, the reference is the position where the
+        hold began; afterwards it continues along the route. Raises UsageError: `method` is not in the table.
 
         Parameters
         ----------
@@ -195,10 +195,6 @@ class Controller:
         hand_share : (2,) velocity over the speed limit by which a hand steers, in the place of the method; None: none
             does.
         driven_um_s : (2,) velocity to demand without any feedback, as the check of the axes does; None: control it.
-
-        Raises
-        ------
-        UsageError : `method` is not in the table.
         """
         if previous is not None and previous.stamp_ns == estimate.stamp_ns:
             return previous

@@ -36,11 +36,8 @@ def corrected_flow(
     The observer's variance is that of the estimate, so an observer without measurements has no weight. An observer that
     assumes a constant flow lags by about `lag_s`, so the change of the map over the displacement in that time is added
     to its variance: where the robot enters another stream the map is better. The standard deviation of the map is its
-    own where it states one, else `map_error` times the speed; the correction never exceeds twice that.
-
-    Parameters
-    ----------
-    sent_um_s : (m, 2) demands that may still be on their way to the coils, oldest first.
+    own where it states one, else `map_error` times the speed; the correction never exceeds twice that. `sent_um_s`: (m,
+    2) demands that may still be on their way to the coils, oldest first.
     """
     if field is None:
         return CorrectedFlow(None, estimate.flow_um_s)

@@ -34,7 +34,8 @@ class FieldRow(NamedTuple):
 class FieldLog:
     """Frequency, heading, amplitude and currents by time; see above.
 
-    It has no lock: an owner whose threads append and read brings one.
+    It has no lock: an owner whose threads append and read brings one. Raises ValueError: stamps that decrease, or
+    arrays of other shapes.
 
     Parameters
     ----------
@@ -42,10 +43,6 @@ class FieldLog:
     frequency_hz, heading_rad, amplitude_mt : (n,)
     currents_a : (n, k) of k coils; None: not known.
     coils : their number k where no currents are given.
-
-    Raises
-    ------
-    ValueError : stamps that decrease, or arrays of other shapes.
     """
 
     def __init__(
@@ -111,9 +108,7 @@ class FieldLog:
     ) -> None:
         """The field from a stamp on; a row of the same stamp is replaced.
 
-        Raises
-        ------
-        ValueError : a stamp before that of the last row.
+        Raises ValueError: a stamp before that of the last row.
         """
         n = self._rows
         if n and stamp_ns < self._times_ns[n - 1]:
@@ -131,11 +126,7 @@ class FieldLog:
         self._rows = n + 1
 
     def extend(
-        self,
-        stamp_ns: int,
-        segments: Iterable[MotionSegment],
-        amplitude_mt: float,
-        currents_a: ArrayLike | None = None,
+        self, stamp_ns: int, segments: Iterable[MotionSegment], amplitude_mt: float, currents_a: ArrayLike | None = None
     ) -> int:
         """Append the segments of a motion of the field, from a stamp on. Returns the stamp of their end."""
         for each in segments:

@@ -25,13 +25,7 @@ import numpy as np
 
 from flowrec.core import Applied, Estimate, Floats, FlowField, Range, Share, Track, seconds
 from flowrec.physics import OBSERVER, Robot, sample_as_seen
-from flowrec.stages.estimation.process_model import (
-    ISOTROPIC,
-    StateLayout,
-    advance_covariance,
-    gradient_at,
-    propagate,
-)
+from flowrec.stages.estimation.process_model import ISOTROPIC, StateLayout, advance_covariance, gradient_at, propagate
 
 _NONE = np.zeros(0)
 # One sigma before anything was measured, in um, and as fractions of v_max per radius and of um_per_rev.
@@ -75,12 +69,7 @@ class Kalman:
     estimate_gain: bool = False
 
     def estimate(
-        self,
-        previous: Estimate | None,
-        track: Track,
-        applied: Applied,
-        robot: Robot,
-        field: FlowField | None = None,
+        self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot, field: FlowField | None = None
     ) -> Estimate:
         """One prediction and, where the robot was seen, one update; with a `field`, the map model.
 

@@ -21,12 +21,7 @@ class Luenberger:
     position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
 
     def estimate(
-        self,
-        previous: Estimate | None,
-        track: Track,
-        applied: Applied,
-        robot: Robot,
-        field: FlowField | None = None,
+        self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot, field: FlowField | None = None
     ) -> Estimate:
         """The position is the measured one; the covariance is nominal, that of filtered noise; `field` is not used."""
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius_um

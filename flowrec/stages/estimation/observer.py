@@ -8,18 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import (
-    Alarm,
-    Applied,
-    Estimate,
-    FlowField,
-    Health,
-    Method,
-    Methods,
-    Share,
-    Track,
-    seconds,
-)
+from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Method, Methods, Share, Track, seconds
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import Kalman, corrects_map, memory_s
 from flowrec.stages.estimation.luenberger import Luenberger
@@ -70,14 +59,12 @@ class Observer:
     ) -> Estimate:
         """The estimate after this frame. The robot's own displacement is um_per_rev times the turns really applied.
 
+        Raises UsageError: `method` is not in the table.
+
         Parameters
         ----------
         field : the best flow known; ignored by methods that do not use a map. Without one, kalman_map is kalman.
         health : of the frame before, by which kalman_auto judges the map. None: not judged.
-
-        Raises
-        ------
-        UsageError : `method` is not in the table.
         """
         row = OBSERVERS[self.method]
         settings, needs = row.section(self), row.needs

@@ -100,9 +100,7 @@ def whiten(time_s: Floats, columns: Floats, flags: Flags, noise: NoiseModel) -> 
 def fit_noise(time_s: Floats, positions_um: Floats, flags: Flags, start: NoiseModel | None = None) -> NoiseModel:
     """The noise that makes positions (n, 2) most likely, with innovations of Student's t distribution.
 
-    Parameters
-    ----------
-    start : where to begin; None: from two ends, a coarse camera and a fast flow.
+    `start`: where to begin; None: from two ends, a coarse camera and a fast flow.
     """
     positions = np.ascontiguousarray(positions_um, np.float64)
     axes = positions.shape[1]

@@ -58,15 +58,7 @@ def step_cost(dx: float, dy: float, vx: float, vy: float, speed: float, idle: fl
 
 @compiled
 def segment_cost(
-    vx: Raster,
-    vy: Raster,
-    speed: Raster,
-    idle: float,
-    x0: float,
-    y0: float,
-    x1: float,
-    y1: float,
-    spacing: float,
+    vx: Raster, vy: Raster, speed: Raster, idle: float, x0: float, y0: float, x1: float, y1: float, spacing: float
 ) -> float:
     """Cost of a straight segment (px) by the midpoint rule, midpoints at most `spacing` px apart."""
     n = max(1, math.ceil(math.hypot(x1 - x0, y1 - y0) / spacing))

@@ -26,11 +26,7 @@ _ACCEPTED = 20  # the height is halved when fewer than one in so many bumps lowe
 
 
 def refined_route(
-    problem: Problem,
-    rasters: CostRasters,
-    path: Points,
-    idle_um_s: float | None = None,
-    spacing: float = SPACING_PX,
+    problem: Problem, rasters: CostRasters, path: Points, idle_um_s: float | None = None, spacing: float = SPACING_PX
 ) -> Route:
     """The timed route along the refinement of a path (n, 2) px, or along the path if the refinement is impossible."""
     route = problem.timed(refine_path(path, rasters, spacing=spacing), idle_um_s)

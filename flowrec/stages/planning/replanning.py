@@ -95,11 +95,7 @@ def _join_routes(present: Route, from_s: float, new: Route, said: str) -> Route:
 
 
 def _noise_s(
-    gain_s: Callable[[FlowField], float],
-    gain: float,
-    field: FlowField,
-    uncertainty: FlowUncertainty | None,
-    chip: Chip,
+    gain_s: Callable[[FlowField], float], gain: float, field: FlowField, uncertainty: FlowUncertainty | None, chip: Chip
 ) -> float:
     """Standard deviation of a gain that follows from that of the flow, to first order; 0 where none is known.
 

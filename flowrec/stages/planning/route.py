@@ -19,10 +19,7 @@ _STEPS_PER_PX = 4.0
 def planning_speed_um_s(share: float, robot: Robot) -> float:
     """The robot's speed through the fluid that a plan counts on: a share of its speed limit, um/s.
 
-    Raises
-    ------
-    UsageError
-        If that is not positive.
+    Raises UsageError if that is not positive.
     """
     # A Python float: numba would compile every kernel anew for another type.
     speed_um_s = float(share * robot.speed_limit_um_s)

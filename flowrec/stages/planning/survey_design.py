@@ -45,33 +45,20 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyOrder:
-    """Input of a survey method.
+    """Input of a survey method."""
 
-    Attributes
-    ----------
-    field : the best flow known.
-    start_um : (2,) where the next stretch begins: the end of `present`, or the robot.
-    goal_um : (2,) that must stay within reach; None: only for methods that do not ask for it.
-    uncertainty : of the flow after the observations so far; None: not known.
-    observations : so far.
-    present : the way that the robot is still on; None: it waits at the start.
-    progress_s : time along `present`, of which the observations up to there have been made.
-    left_s : of the time limit, from the start of the next stretch on.
-    least_s : a stretch counts as if it took so long, because the next one has to be found meanwhile.
-    """
-
-    field: FlowField
-    start_um: Floats
+    field: FlowField  # the best flow known
+    start_um: Floats  # (2,) where the next stretch begins: the end of `present`, or the robot
     chip: Chip
     robot: Robot
-    goal_um: Floats | None = None
-    uncertainty: FlowUncertainty | None = None
+    goal_um: Floats | None = None  # (2,) that must stay within reach; None: only for methods that do not ask for it
+    uncertainty: FlowUncertainty | None = None  # of the flow after the observations so far; None: not known
     sampling: Sampling | None = None
-    observations: Observations | None = None
-    present: Route | None = None
-    progress_s: float = 0.0
-    left_s: float = math.inf
-    least_s: float = 0.0
+    observations: Observations | None = None  # so far
+    present: Route | None = None  # the way that the robot is still on; None: it waits at the start
+    progress_s: float = 0.0  # time along `present`, of which the observations up to there have been made
+    left_s: float = math.inf  # of the time limit, from the start of the next stretch on
+    least_s: float = 0.0  # a stretch counts as if it took so long, because the next one has to be found meanwhile
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,24 +122,16 @@ class Looks:
 
     to look again at the same place tells nothing more of the flow, but it tells of the robot's constants if the robot
     moves otherwise.
-
-    Attributes
-    ----------
-    patch_px : side of a patch.
-    share : of the speed of the flow, one standard deviation of the error that looks at a patch share.
-    pixel : (h, w) index of each fluid pixel among those of the uncertainty.
-    sums : (patches, 2, q + k) sum of w A so far.
-    weights : (patches,) sum of w so far.
     """
 
     uncertainty: FlowUncertainty
     sampling: Sampling
     chip: Chip
-    patch_px: float
-    share: float
-    pixel: NDArray[np.intp]
-    sums: Floats
-    weights: Floats
+    patch_px: float  # side of a patch
+    share: float  # of the speed of the flow, one standard deviation of the error that looks at a patch share
+    pixel: NDArray[np.intp]  # (h, w) index of each fluid pixel among those of the uncertainty
+    sums: Floats  # (patches, 2, q + k) sum of w A so far
+    weights: Floats  # (patches,) sum of w so far
 
     @classmethod
     def none(cls, uncertainty: FlowUncertainty, sampling: Sampling, chip: Chip, patch_px: float, share: float) -> Looks:

@@ -39,22 +39,13 @@ _STATED, _EXPECTED, _MOVED, _PROGRESS, _END = range(5)  # columns of `Route.stre
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyMemory:
-    """Earlier stretches of a survey, on which the choice of its next stretch depends.
+    """Earlier stretches of a survey, on which the choice of its next stretch depends."""
 
-    Attributes
-    ----------
-    stretches : (m, 5) so far, as in `Route.stretches`.
-    flow_um_s : (k, 2) most probable flow now, in some places.
-    stated : relative error of the flow now.
-    moved : by which the most probable flow has changed since the choice before, relative.
-    progress_s : along the route now.
-    """
-
-    stretches: Floats
-    flow_um_s: Floats
-    stated: float
-    moved: float
-    progress_s: float
+    stretches: Floats  # (m, 5) so far, as in `Route.stretches`
+    flow_um_s: Floats  # (k, 2) most probable flow now, in some places
+    stated: float  # relative error of the flow now
+    moved: float  # by which the most probable flow has changed since the choice before, relative
+    progress_s: float  # along the route now
 
     @classmethod
     def of(cls, present: Route | None, mean_um_s: Floats, stated: float, progress_s: float) -> SurveyMemory:

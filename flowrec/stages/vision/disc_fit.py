@@ -153,11 +153,7 @@ def block_means(
 
 @compiled
 def _initial(
-    across: NDArray[np.float64],
-    down: NDArray[np.float64],
-    grey: NDArray[np.float64],
-    radius_px: float,
-    edge_px: float,
+    across: NDArray[np.float64], down: NDArray[np.float64], grey: NDArray[np.float64], radius_px: float, edge_px: float
 ) -> NDArray[np.float64]:
     """Initial parameters (9,): the darkness is the difference between the outermost part and the middle."""
     inner, inner_count, outer, outer_count = 0.0, 1e-9, 0.0, 1e-9

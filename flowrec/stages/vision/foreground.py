@@ -266,12 +266,7 @@ def patch_at(c: NDArray[np.float32], x: float, y: float, half: int) -> NDArray[n
 
 @compiled
 def most_similar(
-    c: NDArray[np.float32],
-    x: float,
-    y: float,
-    views: NDArray[np.float32],
-    window: NDArray[np.float32],
-    reach: int,
+    c: NDArray[np.float32], x: float, y: float, views: NDArray[np.float32], window: NDArray[np.float32], reach: int
 ) -> tuple[int, float, int, int]:
     """The view (n, s, s) most similar to the map near a point: its number, weighted correlation, offset in x and y."""
     rows, columns = c.shape

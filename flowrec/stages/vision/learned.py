@@ -141,18 +141,12 @@ class ForegroundRegion:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """An image with the walls in it.
-
-    Attributes
-    ----------
-    radius_px : of the robot.
-    solid_px : distance to the mask's walls (negative: depth in the solid) from which on a pixel may show fluid.
-    """
+    """An image with the walls in it."""
 
     image: Image
     walls: Walls
-    radius_px: float
-    solid_px: float
+    radius_px: float  # of the robot
+    solid_px: float  # distance to the mask's walls (negative: depth in the solid) from which on a pixel may show fluid
 
     def around(self, box: Box, scale: ReducedScale) -> ForegroundRegion:
         """The foreground of a box and a margin, in which objects on its border are whole."""

@@ -51,11 +51,8 @@ def masked_ncc(
     """Correlation -1 to 1 (rows, columns) with the robot centred on each block of step x step pixels of a box.
 
     Pixels nearer to a wall than the margin do not count, nor do those outside the image. Blocks nearer to a wall than
-    the clearance can not hold the centre and are -1.
-
-    Parameters
-    ----------
-    pattern : (n, n) of mean 0, at the scale of the reduced image; see `template`.
+    the clearance can not hold the centre and are -1. `pattern`: (n, n) of mean 0, at the scale of the reduced image;
+    see `template`.
     """
     height, width = image.shape
     x0, y0 = box[0], box[1]

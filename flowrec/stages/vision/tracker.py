@@ -21,14 +21,7 @@ import numpy as np
 
 from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, UsageError, seconds
 from flowrec.physics import Calibration, Chip, Robot
-from flowrec.stages.vision.disc_search import (
-    LARGEST,
-    Disc,
-    DiscSearch,
-    best_disc,
-    best_disc_normalised,
-    disc_pad_px,
-)
+from flowrec.stages.vision.disc_search import LARGEST, Disc, DiscSearch, best_disc, best_disc_normalised, disc_pad_px
 from flowrec.stages.vision.learned import (
     Candidates,
     ExpectedMotion,
@@ -349,10 +342,7 @@ class Tracker:
         neighbours = np.concatenate([neighbours_of(found, which), covered.ravel()])
         isolated = is_isolated(neighbours, to_px, radius_px)
         track = replace(
-            seen,
-            position_um=calibration.to_um(to_px),
-            score=min(max(score, 0.01), 1.0),
-            neighbours_px=neighbours,
+            seen, position_um=calibration.to_um(to_px), score=min(max(score, 0.01), 1.0), neighbours_px=neighbours
         )
         if not len(covered):
             track = with_motion(track, motion, to_px, float(found.energy[which]))

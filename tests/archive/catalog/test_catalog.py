@@ -15,7 +15,6 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
 
 import flowrec
 from flowrec.archive import verbs
@@ -31,10 +30,9 @@ from flowrec.core.system.outputs import OutputError
 from flowrec.store.session import Session
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import app
 from flowrec.verbs.listed import columns_of
 from flowrec.verbs.ls import ls
-from tests.conftest import HANG_S
+from tests.conftest import HANG_S, typed
 from tests.extras import needs
 from tests.rewritten import rewrite
 from tests.store.made_up import HEADER, ticks_of
@@ -98,10 +96,6 @@ def catalogued(lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def names(where: str = "", **options: Any) -> list[str]:
     return [Path(path).name for path in find(where, **options).paths()]
-
-
-def typed(*words: object) -> Any:
-    return CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
 
 
 # --- what is in a catalog

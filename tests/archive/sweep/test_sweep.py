@@ -17,7 +17,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from scipy.stats import ttest_rel
-from typer.testing import CliRunner
 
 import flowrec
 from tests.extras import why
@@ -33,9 +32,9 @@ from flowrec.core.errors import FlowrecError, UsageError
 from flowrec.core.system.outputs import OutputError
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.verbs.cli import app
 from flowrec.verbs.replay_result import refinement_remarks
 from tests.archive.sweep.rows import row_of
+from tests.conftest import invoke
 from tests.store.made_up import HEADER, ticks_of
 
 GRID = ["refine=fvm,gain"]
@@ -116,7 +115,7 @@ def test_what_can_not_be_swept_is_told_before_any_replay(
         results.put(row_of("c", 0.1, refine="fvm"))
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     words = [str(session) if word == "SESSION" else word for word in words]
-    done = CliRunner().invoke(app, ["sweep", *(words if "-o" in words else [*words, "-o", "out.parquet"])])
+    done = invoke("sweep", *(words if "-o" in words else [*words, "-o", "out.parquet"]))
     assert isinstance(done.exception, FlowrecError), done.output
     assert done.exception.exit_status in (1, 2)
     assert said in str(done.exception)
@@ -261,12 +260,12 @@ def test_ctrl_c_keeps_what_is_done_and_a_second_call_does_the_rest(
     out = tmp_path / "out.parquet"
     words = ["sweep", str(session), "--grid", GRID[0], "-o", str(out), "--json"]
     stop_at = 1
-    assert CliRunner().invoke(app, words).exit_code == 130
+    assert invoke(*words).exit_code == 130
     assert len(read_rows(out)) == 1
     stop_at = 2
-    said = json.loads(CliRunner().invoke(app, words).stdout)
+    said = json.loads(invoke(*words).stdout)
     assert (said["tasks"], said["computed"], said["passed_over"]) == (2, 1, 1)
-    assert json.loads(CliRunner().invoke(app, words).stdout)["computed"] == 0
+    assert json.loads(invoke(*words).stdout)["computed"] == 0
     assert [dict(task.settings)["refine"] for task in done] == ["fvm", "gain"]
     assert [task.judge for task in done] == [True, False]
 
@@ -322,7 +321,7 @@ def test_the_page_of_a_sweep_shows_the_ranking_and_what_has_failed(tmp_path: Pat
             results.put(row_of(content, good, refine="<gain>"))
             results.put(row_of(content, poor, refine="fvm"))
         results.put(row_of("c", refine="fvm") | {"error": "it <hangs>"})
-    assert CliRunner().invoke(app, ["report", str(out)]).exit_code == 0
+    assert invoke("report", out).exit_code == 0
     html = out.with_name("out_report.html").read_text(encoding="utf-8")
     assert "First: refine=&lt;gain&gt;, refined flow error 20.0 %. Next: refine=fvm, 7.5 % more (95 %: " in html
     assert "it &lt;hangs&gt;" in html and 'class="wide"' in html

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from flowrec.core.errors import SessionError
 from flowrec.core.system.durable import append_line, replacing
@@ -20,8 +19,7 @@ from flowrec.core.system.leftovers import OLD, remove_leftovers, temporary_name
 from flowrec.core.system.output_folder import OutputFolder
 from flowrec.core.system.outputs import JSON, Output
 from flowrec.store.notes import append_note, notes_file, read_notes
-from flowrec.verbs.cli import app
-from tests.conftest import until
+from tests.conftest import invoke, until
 
 WAITS = """
 import signal, sys, time
@@ -141,7 +139,7 @@ def test_what_a_killed_process_has_left_is_removed_and_nothing_that_may_be_in_us
 def test_recover_removes_what_killed_processes_have_left_beside_a_session(tmp_path: Path) -> None:
     session = Path(shutil.copy(Path(__file__).parents[3] / "sessions" / "golden_moderate.mcap", tmp_path))
     (tmp_path / name_of_the_dead()).touch()
-    assert CliRunner().invoke(app, ["recover", str(session)]).exit_code == 0
+    assert invoke("recover", session).exit_code == 0
     assert list(tmp_path.iterdir()) == [session]
 
 

@@ -51,16 +51,11 @@ State = dict[str, bytes | None]  # content by path below the root; None: a folde
 
 @dataclass(slots=True)
 class Disk:
-    """The disk below a folder; make it with `recorded`.
+    """The disk below a folder; make it with `recorded`."""
 
-    Attributes
-    ----------
-    root : the folder; what is in it when recording begins is on the disk.
-    check : is called with each state that a power cut may leave, written to a folder of its own.
-    """
-
-    root: Path
+    root: Path  # the folder; what is in it when recording begins is on the disk
     scratch: Path
+    # is called with each state that a power cut may leave, written to a folder of its own
     check: Callable[[Path], None]
     states: int = 0
     _lock: Any = field(default_factory=threading.RLock)

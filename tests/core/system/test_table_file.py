@@ -112,10 +112,7 @@ def test_a_file_that_is_no_table_is_refused(data, tmp_path):
         read_table(tmp_path / "log.csv").numbers("time_s")
 
 
-OVERLONG = {
-    "cell.csv": "t,x\n0,1\n1," + "3" * 200_000 + "\n",
-    "quote.csv": 't,x\n0,1\n1,"2\n' + "2,3\n" * 50_000,
-}
+OVERLONG = {"cell.csv": "t,x\n0,1\n1," + "3" * 200_000 + "\n", "quote.csv": 't,x\n0,1\n1,"2\n' + "2,3\n" * 50_000}
 
 
 @pytest.mark.parametrize("name", OVERLONG)

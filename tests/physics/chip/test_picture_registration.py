@@ -9,13 +9,7 @@ import pytest
 
 from flowrec.core.errors import ChipError
 from flowrec.measure import wall_fit
-from flowrec.measure.picture_registration import (
-    fit_nearby,
-    orientation_by_image,
-    other_scale,
-    overlay,
-    register,
-)
+from flowrec.measure.picture_registration import fit_nearby, orientation_by_image, other_scale, overlay, register
 from flowrec.measure.wall_fit import Fitter
 from flowrec.measure.wall_search import Pose, WallMap
 from flowrec.physics.chip.chip import ChipSettings

@@ -316,12 +316,7 @@ def test_a_lab_that_is_not_ready_is_one_line_and_leaves_no_file(
 @pytest.mark.parametrize(
     ("sets", "package", "module", "told"),
     [
-        (
-            ("lab.camera=pylon",),
-            "pypylon",
-            "cameras.pylon",
-            r"needs pypylon, .* pip install 'flowrec\[pylon\]'",
-        ),
+        (("lab.camera=pylon",), "pypylon", "cameras.pylon", r"needs pypylon, .* pip install 'flowrec\[pylon\]'"),
         (("lab.camera=genicam",), "viva_genicam", "cameras.genicam", r"pip install 'flowrec\[genicam\]'"),
         (("lab.camera=opencv", "lab.amplifier=serial"), "serial", "amplifiers.serial_line", r"'flowrec\[serial\]'"),
         (("lab.camera=opencv", "lab.amplifier=ni"), "nidaqmx", "amplifiers.ni", r"'flowrec\[ni\]'"),

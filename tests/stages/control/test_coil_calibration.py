@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from scipy.stats import t as student
-from typer.testing import CliRunner
 
 from flowrec.core.errors import UsageError
 from flowrec.core.system.outputs import OutputError
@@ -14,7 +13,7 @@ from flowrec.measure.coil_calibration import Excitations, advice, fit_coils, rea
 from flowrec.measure.coil_windings import winding_of, windings_matrix
 from flowrec.measure.proposal import as_sets
 from flowrec.stages.config import load_config
-from flowrec.verbs.cli import app
+from tests.conftest import invoke
 
 A = np.array([[2.1, 0.1, -0.05], [0.08, 1.9, 0.1], [0.02, -0.1, 1.5]])
 BIAS = np.array([0.02, -0.01, -0.045])
@@ -168,11 +167,11 @@ def test_a_run_takes_the_written_settings_and_the_printed_ones_alike(tmp_path):
 
 def test_the_command_says_it_for_people_and_for_programs(tmp_path):
     path = file_of(tmp_path, measured(5))
-    told = CliRunner().invoke(app, ["calibrate", "coils", str(path)])
+    told = invoke("calibrate", "coils", path)
     assert told.exit_code == 0
     assert "12 excitations" in told.stdout and "Weakest direction: z" in told.output
     assert "--set 'coils.mt_per_a=[[2." in told.output
-    figures = json.loads(CliRunner().invoke(app, ["calibrate", "coils", str(path), "--json"]).stdout)
+    figures = json.loads(invoke("calibrate", "coils", path, "--json").stdout)
     np.testing.assert_allclose(figures["mt_per_a"], A, atol=0.05)
     assert figures["degrees_of_freedom"] == 8 and len(figures["left_out_mt"]) == 12
 
@@ -191,7 +190,7 @@ def test_a_table_of_six_coils_gives_a_matrix_of_six_columns_that_a_run_uses(tmp_
     matrix, rows = of_six()
     table, out = tmp_path / "six.csv", tmp_path / "six.toml"
     table.write_text("\n".join(rows))
-    answer = CliRunner().invoke(app, ["calibrate", "coils", str(table), "-o", str(out), "--json"])
+    answer = invoke("calibrate", "coils", table, "-o", out, "--json")
     told = json.loads(answer.stdout)
     np.testing.assert_allclose(told["mt_per_a"], matrix, atol=1e-7)
     assert told["degrees_of_freedom"] == 24 - 7 and told["advice"] == []
@@ -199,7 +198,7 @@ def test_a_table_of_six_coils_gives_a_matrix_of_six_columns_that_a_run_uses(tmp_
     assert coils.count == 6
     np.testing.assert_allclose(coils.mt_per_a, matrix, atol=1e-6)
     np.testing.assert_allclose(coils.bias_mt, BIAS, atol=1e-6)
-    shown = CliRunner().invoke(app, ["calibrate", "coils", str(table)]).stdout
+    shown = invoke("calibrate", "coils", table).stdout
     assert "coil 1" in shown and "coil 6" in shown
 
 
@@ -253,7 +252,7 @@ def test_windings_make_the_configuration_of_a_run_a_column_for_each(tmp_path):
     out = tmp_path / "coils.toml"
     given = ["x:helmholtz:50:120", "y:pair:60:150:65", "z:coil:40:100:30", "-z:coil:40:100:30", "x:maxwell:50:80"]
     words = [word for text in given for word in ("--winding", text)]
-    answer = CliRunner().invoke(app, ["calibrate", "coils", *words, "-o", str(out), "--json"])
+    answer = invoke("calibrate", "coils", *words, "-o", out, "--json")
     assert answer.exit_code == 0, answer.stderr
     coils = load_config(out).coils
     np.testing.assert_allclose(coils.mt_per_a, json.loads(answer.stdout)["mt_per_a"], rtol=1e-5)
@@ -283,5 +282,5 @@ def test_windings_that_are_none_are_refused_in_one_line(texts, says):
 
 @pytest.mark.parametrize("words", [[], ["coils.csv", "--winding", "x:coil:1:1:1"]])
 def test_calibrate_coils_takes_a_table_or_windings_and_not_both(words):
-    told = CliRunner().invoke(app, ["calibrate", "coils", *words]).exception
+    told = invoke("calibrate", "coils", *words).exception
     assert isinstance(told, UsageError) and "give a table of measured fields, or --winding" in str(told)

@@ -248,10 +248,7 @@ def test_a_mission_with_six_coils_says_once_what_the_coils_could_not_do():
         ),
         (["coils.mt_per_a=[[1, 0, 1, 1], [0, 1, 1, 1], [0, 0, 0, 0]]"], "no currents make a field along z"),
         (
-            [
-                "coils.mt_per_a=[[1, 0, 0, 0.001], [0, 1, 0, 0], [0, 0, 1, 0]]",
-                "coils.bias_mt=[0, 6, 0]",
-            ],
+            ["coils.mt_per_a=[[1, 0, 0, 0.001], [0, 1, 0, 0], [0, 0, 1, 0]]", "coils.bias_mt=[0, 6, 0]"],
             r"coil 2 needs all of it against coils\.bias_mt",
         ),
     ],

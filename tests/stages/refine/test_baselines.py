@@ -208,9 +208,7 @@ def test_unet_corrects_the_assumed_field_by_what_was_observed_in_units_of_its_ow
     assert field.method == "unet" and field.std_um_s is None and "observations" in field.note
     # Twice the flow in and seen, twice the flow out.
     double = replace(
-        case.assumed,
-        velocity_um_s=2.0 * case.assumed.velocity_um_s,
-        pressure_pa=2.0 * case.assumed.pressure_pa,
+        case.assumed, velocity_um_s=2.0 * case.assumed.velocity_um_s, pressure_pa=2.0 * case.assumed.pressure_pa
     )
     seen = case.observations
     faster = replace(seen, flow_um_s=2.0 * seen.flow_um_s, std_um_s=2.0 * seen.std_um_s)

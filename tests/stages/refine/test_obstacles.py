@@ -71,10 +71,7 @@ def test_the_survey_doubts_the_branch_that_carries_too_little_and_then_the_place
     x = every.position_um[:, 0]
     for seen, within_um, least in ((np.abs(x - AT_UM[0]) > 600.0, 2500.0, 0.5), (x > 0.0, 400.0, 0.8)):
         some = replace(
-            every,
-            position_um=every.position_um[seen],
-            flow_um_s=every.flow_um_s[seen],
-            std_um_s=every.std_um_s[seen],
+            every, position_um=every.position_um[seen], flow_um_s=every.flow_um_s[seen], std_um_s=every.std_um_s[seen]
         )
         doubts = PLAIN.uncertainty(assumed, some, chip, SOLVER).doubts
         rows, columns = np.nonzero(chip.mask)
