@@ -49,7 +49,16 @@ def counting(
     given: Annotated[int, Supplied(lambda: 40)] = 0,
     hidden: int = 7,
 ) -> Counted:
-    """Count up to a limit. `given`: what the terminal makes. Raises UsageError: never."""
+    """Count up to a limit.
+
+    Parameters
+    ----------
+    given : what the terminal makes.
+
+    Raises
+    ------
+    UsageError : never.
+    """
     if plan == "astar":
         raise MisuseError("a plan does not count", "--plan")
     if plan == "stop":

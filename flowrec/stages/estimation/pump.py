@@ -51,7 +51,8 @@ class PumpFollower:
     channel: str = ""  # stream and channel that measure it, such as pump/flow; '': nothing does
     # value of the channel, in its unit, at which the inlets have the speeds that the chip states
     nominal: Annotated[float, Range(1e-12, 1e12)] = 1.0
-    inlets: tuple[str, ...] = ()  # of several pumps: the channel of each inlet, in the order of the chip's openings
+    # channel of each inlet, in the order of the chip's openings, where each has a pump of its own; instead of `channel`
+    inlets: tuple[str, ...] = ()
     nominals: tuple[
         Annotated[float, Range(1e-12, 1e12)], ...
     ] = ()  # values of these channels at the speeds that the chip states; []: nominal for all

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -50,5 +51,5 @@ def test_a_route_of_a_mission_is_planned_with_one_blas_thread(monkeypatch: pytes
     monkeypatch.setattr(workers, "route", route)
     order = replace(tick, mission=replace(tick.mission, wanted="route"))
     with threadpool_limits(limits=2, user_api="blas"):
-        workers.work(None, order)  # type: ignore[arg-type]
+        workers.work(SimpleNamespace(inlets=None), order)  # type: ignore[arg-type]
     assert seen == [1]
