@@ -40,7 +40,7 @@ from .inputs import (
     with_inputs as with_inputs,
 )
 from .pipeline import (
-    Pipeline as Pipeline, Sight as Sight, assemble as assemble, look as look, step as step,
+    Pipeline as Pipeline, assemble as assemble, step as step,
 )
 from .planning.eikonal import descend as descend, time_field as time_field
 from .planning.feasibility import no_room as no_room, swept_out as swept_out, too_swift as too_swift
@@ -84,6 +84,7 @@ from .setting_rows import (
     SettingRow as SettingRow, commented_toml as commented_toml, section_summary as section_summary,
     setting_rows as setting_rows,
 )
+from .sight import Sight as Sight, look as look
 from .simulated_settings import (
     Optics as Optics, Simulated as Simulated, SimulatedImage as SimulatedImage,
 )

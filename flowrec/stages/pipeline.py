@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,30 +17,23 @@ from flowrec.core import (
     FIXED,
     PUMP,
     Action,
-    Appearance,
     Applied,
     AxesCheck,
-    Background,
     Estimate,
-    Extra,
     Floats,
     FlowField,
-    Frame,
     Message,
     Observations,
     Phase,
     PumpShare,
     RobotWalls,
-    Shift,
     Source,
     Tick,
     TopicTable,
-    Tracers,
     Track,
     UsageError,
     nearest_pixel,
     seconds,
-    shift_px,
 )
 from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, on_chip, sample
 from flowrec.stages.config import ResolvedConfig, calibration_of
@@ -54,18 +46,16 @@ from flowrec.stages.estimation.pump import PumpFollower, at_pump
 from flowrec.stages.estimation.superposition import Superposition
 from flowrec.stages.estimation.tracer_stretches import collect_stretches
 from flowrec.stages.extra_topics import ExtraStage, extra_rows, topics_of
-from flowrec.stages.inputs import FROM_IMAGE, Inputs, with_inputs
+from flowrec.stages.inputs import Inputs, with_inputs
 from flowrec.stages.other_robots import (
     OtherRobots,
-    expected_robots,
-    expected_unmoved,
     messages_of_others,
     observe_others,
-    tracks_of_others,
 )
 from flowrec.stages.planning import Planner, SurveyPlanner
 from flowrec.stages.refine import Refiner
-from flowrec.stages.vision import Expected, Stabiliser, Tracker, move_neighbours, unseen
+from flowrec.stages.sight import find_robots
+from flowrec.stages.vision import Stabiliser, Tracker
 
 _RELEASE_S = 0.2  # from the moment at which a held robot may be let go until it is taken to be free
 
@@ -180,70 +170,6 @@ def _strength(coils: Coils, last: Tick) -> float:
     return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
 
 
-class Sight(NamedTuple):
-    """Results of an image: the robot, how it looks, how far the image lies off, the tracers, and the other robots."""
-
-    track: Track | None = None
-    appearance: Appearance | None = None
-    background: Background | None = None
-    shift: Shift | None = None
-    tracers: Tracers | None = None
-    others: tuple[Track, ...] = ()
-
-
-def look(p: Pipeline, last: Sight, frame: Frame, expected: Sequence[Expected] = ()) -> Sight:
-    """Register the next image and find the robot in it; or all of several, each of which is expected somewhere."""
-    shift, background = p.stabiliser.register(
-        last.shift, last.background, last.track, frame, p.chip, p.calibration, p.robot
-    )
-    previous = last.track
-    if shift is not None and previous is not None and last.shift is not None:
-        previous = move_neighbours(previous, shift.shift_px - last.shift.shift_px)
-    off_px = shift_px(shift)
-    others: list[Track] = []
-    if p.tracker.count > 1:
-        seen = [] if previous is None else [previous, *last.others]
-        expected = expected or [expected_unmoved(track, p.robot, frame.stamp_ns) for track in seen]
-        (first, *others), appearance = p.tracker.follow_all(
-            seen, expected, last.appearance, frame, p.chip, p.calibration, p.robot, off_px, np.array(p.mission.start)
-        )
-        found: tuple[Track, Appearance | None] = first, appearance
-    else:
-        found = p.tracker.follow(previous, last.appearance, frame, p.chip, p.calibration, p.robot, off_px)
-    tracers = None
-    if p.tracker.tracers:
-        tracers = p.tracker.tracer.follow(last.tracers, found[0], frame, p.chip, p.calibration, p.robot, off_px, others)
-    return Sight(*found, background, shift, tracers, tuple(others))
-
-
-def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
-    """Position of the robots, when each was last seen, and how they look. A repeated image counts as not seen."""
-    count, known = p.tracker.count, tracks_of_others(last, p.tracker.count)
-    previous, before = last.track, Sight(*(getattr(last, name) for name in FROM_IMAGE))._replace(others=tuple(known))
-    if inputs.applied.repeats_image and previous is not None:
-        others = tuple(unseen(each, inputs.stamp_ns) for each in known)
-        return before._replace(track=unseen(previous, inputs.stamp_ns), others=others)
-    if inputs.frame is None:
-        assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
-        new = {name: message for name in FROM_IMAGE if (message := getattr(inputs, name)) is not None}
-        return before._replace(**new, others=tuple(tracks_of_others(Tick(extra=Extra(inputs.extra)), count)))
-    expected = expected_robots(last, count, inputs.applied, inputs.stamp_ns, p.robot) if known else []
-    sight = look(p, before, inputs.frame, expected)
-    if sight.others:
-        before_them: list[Track | None] = [*known] or [None] * len(sight.others)
-        pairs = zip(sight.others, before_them, strict=True)
-        sight = sight._replace(others=tuple(replace(new, seen_ns=_seen_ns(new, old)) for new, old in pairs))
-    track = sight.track
-    if inputs.applied.image_since_ns is None or track is None:
-        return sight
-    return sight._replace(track=replace(track, seen_ns=_seen_ns(track, previous)))
-
-
-def _seen_ns(track: Track, previous: Track | None) -> int | None:
-    """Stamp of the latest frame in which a robot was seen."""
-    return track.stamp_ns if track.seen else None if previous is None else previous.seen_ns
-
-
 def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track, rolled: Applied) -> tuple[AxesCheck | None, Floats | None]:
     """The check of the axes, and the velocity (2,) that it drives the robot with; None: the robot is controlled."""
     mission = last.mission
@@ -286,7 +212,7 @@ def _follow_others(
     walls = p.others.watch(last, tracks, estimates, p.robot, radii_um, p.clearance_um, p.chip.um_per_px)
 
     def at_nominal(before: Observations | None, now: Observations | None) -> Observations | None:
-        return now if pump is None else p.pump.at_nominal(before, now, pump)
+        return now if pump is None else p.pump.at_nominal(before, now, pump, p.inlets)
 
     seen = p.others.collect(p.sampler, last, estimates, walls, p.robot, at_nominal)
     return walls, messages_of_others(tracks, estimates, walls) | seen
@@ -319,7 +245,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     tick = with_inputs(last, inputs, p.topics)
     pump = p.pump.follow(last, tick, p.inlets, p.tracker.tracer.stretch_s if p.tracker.tracers else 0.0)
     flow, route = at_pump(tick.field, pump, p.inlets), tick.route
-    sight = _find_robot(p, last, inputs)
+    sight = find_robots(p, last, inputs)
     track, appearance = sight.track, sight.appearance
     assert track is not None, "the tracker says of every image whether it shows the robot"
     lap("track")

@@ -11,7 +11,7 @@ import pytest
 
 from flowrec.core.errors import UsageError
 from flowrec.physics.chip.io import load_chip
-from flowrec.stages import pipeline
+from flowrec.stages import Sight, pipeline
 from flowrec.stages.config import load_config
 from flowrec.stages.resolve import resolve
 from flowrec.store.reader import SessionReader
@@ -55,13 +55,13 @@ def test_a_replay_of_an_observation_is_exact_and_its_file_is_whole(observed: Pat
 
 @pytest.mark.slow("flies an observation")
 def test_a_robot_out_of_sight_ends_no_observation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = pipeline._find_robot
+    found = pipeline.find_robots
 
-    def blind(*known: Any) -> pipeline.Sight:
+    def blind(*known: Any) -> Sight:
         sight = found(*known)
         return sight._replace(track=replace(sight.track, seen=False, seen_ns=None))
 
-    monkeypatch.setattr(pipeline, "_find_robot", blind)
+    monkeypatch.setattr(pipeline, "find_robots", blind)
     limits = ("mission.find_limit_s=0.5", "mission.lost_limit_frames=3")
     done = record(load_config(GOLDEN, [*OBSERVE, *limits]), tmp_path / "s.mcap")
     assert done.report.outcome == "not found"
