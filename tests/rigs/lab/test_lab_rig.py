@@ -23,8 +23,9 @@ from flowrec.rigs.lab.cameras.grabber import Grabber
 from flowrec.rigs.lab.rig import LabRig
 from flowrec.rigs.rig import checked_images
 from flowrec.stages.config import ResolvedConfig, load_config
-from flowrec.stages.pipeline import Sight, assemble, look
+from flowrec.stages.pipeline import assemble
 from flowrec.stages.resolve import resolve
+from flowrec.stages.sight import Sight, look
 from flowrec.verbs.record import record
 from tests.conftest import HANG_S, until
 from tests.extras import why
