@@ -347,9 +347,10 @@ def test_steering_ends_by_release_by_nonsense_and_by_silence(scene: Scene, sent:
             time.sleep(0.01)
             page.send(sent)
         assert why_ended(served.control) == why
+        time.sleep(0.01)  # a sample that follows the one before at once is passed over
         page.send(sample())
         refused = [words["refusal"] for words in itertools.islice(answers_to(page), 3 if sent else 2)]
-        assert "let go of the button" in refused[-1], refused
+        assert any("let go of the button" in refusal for refusal in refused), refused
 
 
 REFUSED = {
