@@ -27,6 +27,7 @@ from flowrec.stages.inputs import Inputs
 pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")
 tty = pytest.importorskip("tty", reason="no pseudo terminals on this system")
 
+MOST_TICKS = 1500  # 30 s
 GENERATOR = {
     "lines": ["VOLT {:.2f}", "FREQ {:.0f}"],
     "values": [2.0, 1e6],
@@ -99,30 +100,35 @@ def streams_of(control: RunControl, told: list[str], **device: Any) -> tuple[Str
     return StreamInputs(config.streams, clock, control, told.append, log, realtime=True), clock, log  # type: ignore[arg-type]
 
 
-def flown(device: Device, act: Callable[[RunControl, RunLog], None], **settings: Any) -> tuple[np.ndarray, RunControl]:
-    """The values of both channels, (n, 2), of half a second before and after something is done."""
-    control, told, found = RunControl(), list[str](), list[np.ndarray]()
+def flown(
+    device: Device, act: Callable[[RunControl, RunLog], None], last: list[float], **settings: Any
+) -> tuple[np.ndarray, RunControl]:
+    """The values of both channels, (n, 2): something is done after the first, and the run ends with those of `last`."""
+    control, told, found = RunControl(), list[str](), list[list[float]]()
     streams, clock, log = streams_of(control, told, port=device.port, **settings)
     with ExitStack() as stack:
         streams.connect(stack)
         assert device_has(device, "VOLT 2.00", "FREQ 1000000"), device.lines  # before the run
         stack.enter_context(streams)
+        acted = False
         for number, joined in enumerate(streams.join(ticks(clock))):
             if SAMPLES in joined.extra:
-                found.append(joined.extra[SAMPLES].value.reshape(-1, 2))  # type: ignore[attr-defined]
-            if number == 25:
+                found += joined.extra[SAMPLES].value.reshape(-1, 2).tolist()  # type: ignore[attr-defined]
+            if found and not acted:
+                acted = True
                 act(control, log)
-            if number == 60:
+            if (acted and found[-1] == last) or number > MOST_TICKS:
                 break
     assert not told
-    return np.concatenate(found), control
+    return np.array(found), control
 
 
-def device_has(device: Device, *lines: str) -> bool:
+def device_has(device: Device, *lines: str, last: int = 0) -> bool:
+    """True if the device gets these lines within 5 s, among all or as the last ones."""
     end_s = time.monotonic() + 5.0
-    while not set(lines) <= set(device.lines) and time.monotonic() < end_s:
+    while not (there := set(lines) <= set(device.lines[-last:])) and time.monotonic() < end_s:
         time.sleep(0.01)
-    return set(lines) <= set(device.lines)
+    return there
 
 
 def test_an_output_is_set_before_the_run_by_console_and_program_in_it_and_to_rest_after_it() -> None:
@@ -132,17 +138,18 @@ def test_an_output_is_set_before_the_run_by_console_and_program_in_it_and_to_res
         assert obey(control, {"command": "output", "name": "generator/volt", "value": 4.5}) == ""
         log.set("generator/hertz", 2e6)
 
-    values, control = flown(device, act)
+    values, control = flown(device, act, [4.5, 2e6])
     assert values[0].tolist() == [2.0, 1e6] and values[-1].tolist() == [4.5, 2e6]
-    assert device_has(device, "VOLT 4.50", "FREQ 2000000", "VOLT 0.00")
-    assert device.lines[-2:] == ["VOLT 0.00", "FREQ 1000000"]  # however the run ends
+    assert device_has(device, "VOLT 4.50", "FREQ 2000000")
+    assert device_has(device, "VOLT 0.00", "FREQ 1000000", last=2)  # however the run ends
     noted = [control.next_event(1, held=False), control.next_event(2, held=False)]
     assert [each.text for each in noted if each] == ["generator/volt set to 4.5", "generator/hertz set to 2e+06"]
 
 
 def test_where_the_device_is_asked_its_answer_is_recorded_and_not_the_wish() -> None:
     device = Device()
-    values, _ = flown(device, lambda control, _: control.set_output("generator/volt", 4.5), ask=["VOLT?", "FREQ?"])
+    asked = {"ask": ["VOLT?", "FREQ?"]}
+    values, _ = flown(device, lambda control, _: control.set_output("generator/volt", 4.5), [3.0, 1e6], **asked)
     assert values[0].tolist() == [2.0, 1e6] and values[-1].tolist() == [3.0, 1e6]  # 3 V is all that it gives
 
 
@@ -171,7 +178,7 @@ def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_
             states += [joined.extra[STREAMS]] if STREAMS in joined.extra else []
             if number == 10:
                 device.unplug()
-            if (states and states[-1].state[0] == SILENT) or number > 500:
+            if (states and states[-1].state[0] == SILENT) or number > MOST_TICKS:
                 break
     assert states[-1].state[0] == SILENT and control.reason == "stream generator is silent"
     assert any("the device on" in line and "does not answer" in line for line in told), told
