@@ -168,9 +168,12 @@ def test_a_value_beyond_its_limits_an_unknown_output_and_one_without_a_run_are_r
     assert control.next_event(1, held=False) is None  # nothing is noted of what was not done
 
 
-def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_says_so() -> None:
+@pytest.mark.parametrize("settings", [{}, {"rest": []}, {"ask": ["VOLT?", "FREQ?"]}])
+def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_says_so(
+    settings: dict[str, Any],
+) -> None:
     device, control, told, states = Device(), RunControl(), list[str](), list[Any]()
-    streams, clock, _ = streams_of(control, told, port=device.port)
+    streams, clock, _ = streams_of(control, told, port=device.port, **settings)
     with ExitStack() as stack:
         streams.connect(stack)
         stack.enter_context(streams)
@@ -182,6 +185,7 @@ def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_
                 break
     assert states[-1].state[0] == SILENT and control.reason == "stream generator is silent"
     assert any("the device on" in line and "does not answer" in line for line in told), told
+    assert sum("looked for again" in line for line in told) == 1, told
 
 
 def test_a_port_that_another_has_opened_such_as_the_amplifier_gets_no_line() -> None:

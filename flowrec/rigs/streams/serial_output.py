@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 import threading
 import time
 from collections import deque
@@ -36,6 +37,12 @@ from flowrec.core import Range, UsageError
 from flowrec.rigs.streams.stream import Chunk, NoStreamError, StreamHead
 from flowrec.stages import StreamSettings
 
+if sys.platform == "win32":
+    _GONE: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+else:
+    import termios
+
+    _GONE = (serial.SerialException, OSError, termios.error)  # what a port that is gone raises
 _ANSWER_S = 0.5  # in which a device answers
 _WRITE_S = 1.0
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -122,7 +129,7 @@ class SerialOutput:
         name, baud = self._settings.port, self._settings.baud
         try:  # exclusively: the amplifier, which does so too, gets no line that is not meant for it
             self._port = serial.Serial(name, baud, timeout=_ANSWER_S, write_timeout=_WRITE_S, exclusive=True)
-        except (serial.SerialException, OSError) as error:
+        except _GONE as error:
             raise NoStreamError(f"no device on {name!r}: {error}") from error
         for place, value in enumerate(self._values):
             self._send(self._settings.lines[place].format(value))
@@ -155,7 +162,7 @@ class SerialOutput:
         port, self._port = self._port, None
         if port is None:
             return
-        with suppress(serial.SerialException, OSError):  # what is unplugged can not be set
+        with suppress(*_GONE):  # what is unplugged can not be set
             for line, value in zip(self._settings.lines, self._settings.rest, strict=False):
                 port.write(line.format(value).encode() + b"\n")
             port.flush()
@@ -182,5 +189,5 @@ class SerialOutput:
         assert self._port is not None, "the stream is open"
         try:
             yield self._port
-        except (serial.SerialException, OSError) as error:
+        except _GONE as error:
             raise NoStreamError(f"the device on {self._settings.port} does not answer: {error}") from error
