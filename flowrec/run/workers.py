@@ -197,11 +197,12 @@ class ReplayWorker(LockstepWorker):
         super().submit(order)
         if self._order is order:
             mission, name = order_of(order)
-            one, other = messages_read(order, name), messages_read(self._recorded(), name)
+            recorded = self._recorded()
+            one, other = messages_read(order, name), messages_read(recorded, name)
             self._unchanged = (
                 mission.wanted in self._same
-                and order.stamp_ns == self._recorded().stamp_ns
-                and _alike(mission, self._recorded().mission)
+                and order.stamp_ns == recorded.stamp_ns
+                and _alike(mission, recorded.mission)
                 and one.keys() == other.keys()
                 and all(_alike(message, other[each]) for each, message in one.items())
             )

@@ -83,14 +83,16 @@ class RobotStatistics:
         words = [f"tracked in {self._seen / max(self._images, 1):.0%} of {self._images} images"]
         if math.isfinite(self._nearest_um):
             words.append(f"at least {self._nearest_um:.0f} um from walls")
-        counts = {"alarm near walls": self._alarms, "wall contact": self._contacts}
+        words.append(f"{_count_text(self._alarms, 'alarm')} near walls")
+        if self._contacts is not None:
+            words.append(_count_text(self._contacts, "wall contact"))
         if self._observations:
-            counts["flow observation"] = self._observations
-        for name, count in counts.items():
-            first, _, rest = name.partition(" near")
-            if count is not None:
-                words.append(f"{count} {first}{'' if count == 1 else 's'}{_ + rest}")
+            words.append(_count_text(self._observations, "flow observation"))
         return ", ".join(words)
+
+
+def _count_text(count: int, name: str) -> str:
+    return f"{count} {name}{'' if count == 1 else 's'}"
 
 
 class RunStatistics:

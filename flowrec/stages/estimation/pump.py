@@ -8,7 +8,6 @@ that a refinement sees a steady flow; the error of the measurement is added to t
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ from flowrec.core import (
 )
 from flowrec.physics import Chip
 from flowrec.stages.estimation.kalman import memory_s
-from flowrec.stages.estimation.superposition import Superposition
+from flowrec.stages.estimation.superposition import Superposition, at_share
 
 _SLOW_S = 5.0  # memory of the mean that plans are made with
 _REYNOLDS = 1.0  # above it a flow is not proportional to the speed at its inlets
@@ -53,9 +52,8 @@ class PumpFollower:
     nominal: Annotated[float, Range(1e-12, 1e12)] = 1.0
     # channel of each inlet, in the order of the chip's openings, where each has a pump of its own; instead of `channel`
     inlets: tuple[str, ...] = ()
-    nominals: tuple[
-        Annotated[float, Range(1e-12, 1e12)], ...
-    ] = ()  # values of these channels at the speeds that the chip states; []: nominal for all
+    # values of these channels at the speeds that the chip states; []: `nominal` for all
+    nominals: tuple[Annotated[float, Range(1e-12, 1e12)], ...] = ()
     error_share: Annotated[float, Range(0.0, 1.0)] = 0.02  # standard deviation of the measured value, as a ratio
     delay_s: Annotated[float, Range(0.0, 60.0)] = 0.0  # time from a change of the flow to the sample that shows it
     smoothing_s: Annotated[float, Range(0.0, 60.0)] = 0.05  # memory of the mean over samples
@@ -118,7 +116,7 @@ class PumpFollower:
         now = self._share_of(last, tick, previous, self.channel, self.nominal)
         if now is None or memory_s <= 0.0:
             return now
-        if previous is None:
+        if previous is None or not len(previous.mark_s):  # the last: a replay that follows tracers from a tick on
             return replace(now, mark_s=np.array([seconds(tick.stamp_ns)]), flowed_s=np.zeros(1))
         return _with_marks(previous, now, memory_s + self.delay_s)
 
@@ -126,7 +124,9 @@ class PumpFollower:
         self, last: Tick, tick: Tick, previous: PumpShare | None, inlets: Superposition
     ) -> PumpShare | None:
         """The shares of several pumps; one that has not told anything yet is as it was set, once another has."""
-        before = [None] * len(self.inlets) if previous is None else [*_rows(previous)]
+        rows = [] if previous is None else [*_rows(previous)]
+        # Rows of another number of pumps are those of a replay that follows other pumps from a tick on.
+        before = rows if len(rows) == len(self.inlets) else [None] * len(self.inlets)
         nominals = self.nominals or (self.nominal,) * len(self.inlets)
         each = [
             self._share_of(last, tick, row, channel, nominal)
@@ -243,18 +243,6 @@ def _filter_s(last: Tick) -> float:
     """Memory of the filter from whose estimates the observations are taken."""
     estimate: Estimate | None = last.mapless if last.mapless is not None else last.estimate
     return 0.0 if estimate is None else min(memory_s(estimate.covariance), _SLOW_S)
-
-
-@functools.lru_cache(maxsize=2)
-def at_share(flow: FlowField, share: float) -> FlowField:
-    """A flow at a share of its speed everywhere."""
-    share32 = np.float32(share)
-    return replace(
-        flow,
-        velocity_um_s=flow.velocity_um_s * share32,
-        pressure_pa=flow.pressure_pa * share32,
-        std_um_s=None if flow.std_um_s is None else flow.std_um_s * share32,
-    )
 
 
 _NOW, _SLOW, _OBSERVED = range(3)  # of the numbers of an inlet

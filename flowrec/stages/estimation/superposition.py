@@ -18,6 +18,18 @@ from flowrec.core import Floats, FlowField
 from flowrec.physics import Chip, FlowSolver, sample
 
 
+@functools.lru_cache(maxsize=2)
+def at_share(flow: FlowField, share: float) -> FlowField:
+    """A flow at a share of its speed everywhere."""
+    share32 = np.float32(share)
+    return replace(
+        flow,
+        velocity_um_s=flow.velocity_um_s * share32,
+        pressure_pa=flow.pressure_pa * share32,
+        std_um_s=None if flow.std_um_s is None else flow.std_um_s * share32,
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Superposition:
     """The flow of each inlet alone.
@@ -60,11 +72,11 @@ def _alone(chip: Chip, inlet: int) -> Chip:
 
 @functools.lru_cache(maxsize=2)
 def _at_shares(inlets: Superposition, flow: FlowField, shares: tuple[float, ...]) -> FlowField:
-    mean = np.float32(inlets.mean(np.array(shares)))
-    velocity_um_s, pressure_pa = flow.velocity_um_s * mean, flow.pressure_pa * mean
+    mean = inlets.mean(np.array(shares))
+    found = at_share(flow, mean)
+    velocity_um_s, pressure_pa = found.velocity_um_s, found.pressure_pa
     for share, part in zip(shares, inlets.parts, strict=True):
-        away = np.float32(share) - mean
+        away = np.float32(share - mean)
         velocity_um_s = velocity_um_s + away * part.velocity_um_s
         pressure_pa = pressure_pa + away * part.pressure_pa
-    std_um_s = None if flow.std_um_s is None else flow.std_um_s * mean
-    return replace(flow, velocity_um_s=velocity_um_s, pressure_pa=pressure_pa, std_um_s=std_um_s)
+    return replace(found, velocity_um_s=velocity_um_s, pressure_pa=pressure_pa)

@@ -15,8 +15,8 @@ from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.chip.fluid import PowerLaw
 from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.estimation.pump import PumpFollower, as_planned, at_pump, at_share
-from flowrec.stages.estimation.superposition import Superposition
+from flowrec.stages.estimation.pump import PumpFollower, as_planned, at_pump
+from flowrec.stages.estimation.superposition import Superposition, at_share
 
 STEP_S = 0.04
 
@@ -32,11 +32,8 @@ def channel(*values: float) -> Chip:
     return Chip("channel", mask, 10.0, (Opening("left", 6, 13, "inlet", 200.0), *outlets), 1.0, 1000.0)
 
 
-def flown(
-    pump: PumpFollower, measured: list[float], memory_s: float = 0.0, inlets: Superposition | None = None
-) -> list[PumpShare | None]:
-    """The share at each tick, with one sample a tick, taken at the tick."""
-    states = StreamStates(
+def states_of() -> StreamStates:
+    return StreamStates(
         0,
         "pump",
         "pump/other\npump/flow",
@@ -44,13 +41,25 @@ def flown(
         *(np.ones(1, np.int32), *(np.zeros(1, np.int64),) * 5),
         *(np.zeros(1),) * 3,
     )
+
+
+def samples_of(stamp: int, value: float) -> Samples:
+    """A sample of each channel: 99 of the first, this of the second."""
+    values = np.array([99.0, value])
+    return Samples(stamp, np.array([0, 1], np.int32), np.array([stamp, stamp]), values, values)
+
+
+def flown(
+    pump: PumpFollower, measured: list[float], memory_s: float = 0.0, inlets: Superposition | None = None
+) -> list[PumpShare | None]:
+    """The share at each tick, with one sample a tick, taken at the tick."""
+    states = states_of()
     last, shares = Tick(), list[PumpShare | None]()
     for number, value in enumerate(measured):
         stamp = round(number * STEP_S * NS_PER_S)
         new: dict[str, object] = {STREAMS: states}
         if np.isfinite(value):
-            place, times = np.array([0, 1], np.int32), np.array([stamp, stamp])
-            new[SAMPLES] = Samples(stamp, place, times, np.array([99.0, value]), np.array([99.0, value]))
+            new[SAMPLES] = samples_of(stamp, value)
         tick = Tick(stamp, extra=last.extra.with_messages(new))  # type: ignore[arg-type]
         share = pump.follow(last, tick, inlets, memory_s)
         shares.append(share)
@@ -218,6 +227,18 @@ def test_each_of_two_pumps_is_followed_as_a_single_one_is_and_observed_as_the_ob
     found = TWO.at_nominal(None, one_um, uneven, inlets)
     away_um_s = inlets.departure_um_s(one_um.position_um, np.array([3.0, 2.0]))
     assert found is not None and found.flow_um_s == pytest.approx((one_um.flow_um_s - away_um_s) / 3.0)
+
+
+def test_a_replay_that_follows_two_pumps_or_tracers_from_a_tick_on_begins_there() -> None:
+    inlets = Superposition.of(junction(), SOLVER)
+    alone = PumpFollower("pump/flow", nominal=10.0)
+    recorded = flown(alone, [12.0])[0]
+    assert recorded is not None
+    last = Tick(0, extra=Tick().extra.with_messages({PUMP: recorded}))
+    tick = Tick(1, extra=last.extra.with_messages({STREAMS: states_of(), SAMPLES: samples_of(1, 9.0)}))
+    of_two, with_marks = TWO.follow(last, tick, inlets), alone.follow(last, tick, memory_s=4.0)
+    assert of_two is not None and of_two.inlets[[0, 4]] == pytest.approx([1.0, 0.9])
+    assert with_marks is not None and with_marks.mark_s.tolist() == [1e-9]
 
 
 @pytest.mark.parametrize(
