@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,12 @@ import pytest
 
 from flowrec.core import outside
 from flowrec.core.errors import UsageError
-from flowrec.core.messages import SAMPLES, SILENT, STREAMS, Applied
+from flowrec.core.messages import SAMPLES, SILENT, STREAMS
 from flowrec.run.control import RunControl
 from flowrec.run.stream_inputs import StreamInputs
 from flowrec.stages.config import load_config
-from flowrec.stages.inputs import Inputs
 from flowrec.stages.stream_settings import STREAM_KINDS
+from tests.real_time import Clock, ticks
 
 pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")
 tty = pytest.importorskip("tty", reason="no pseudo terminals on this system")
@@ -70,21 +69,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         monkeypatch.setattr(f"flowrec.{where}.entry_points_of", entry_points_of)
     yield
     STREAM_KINDS._others.clear()
-
-
-@dataclass
-class Clock:
-    """A rig whose stamp 0 is now."""
-
-    epoch_ns: int | None
-
-
-def ticks(clock: Clock) -> Iterator[Inputs]:
-    while True:
-        time.sleep(0.03)
-        assert clock.epoch_ns is not None
-        stamp = time.monotonic_ns() - clock.epoch_ns
-        yield Inputs(stamp, None, Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2)))
 
 
 @pytest.mark.usefixtures("installed")

@@ -6,9 +6,8 @@ import os
 import select
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,13 +15,13 @@ import pytest
 import serial
 
 from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import SAMPLES, SILENT, STREAMS, Applied
+from flowrec.core.messages import SAMPLES, SILENT, STREAMS
 from flowrec.rigs.streams.log import RunLog
 from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import obey
 from flowrec.run.stream_inputs import StreamInputs
 from flowrec.stages.config import load_config
-from flowrec.stages.inputs import Inputs
+from tests.real_time import Clock, ticks
 
 pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")
 tty = pytest.importorskip("tty", reason="no pseudo terminals on this system")
@@ -71,20 +70,6 @@ class Device:
         self._thread.join()
         os.close(self._master)
         os.close(self._slave)
-
-
-@dataclass
-class Clock:
-    """A rig whose stamp 0 is now."""
-
-    epoch_ns: int | None
-
-
-def ticks(clock: Clock) -> Iterator[Inputs]:
-    while True:
-        time.sleep(0.02)
-        stamp = time.monotonic_ns() - (clock.epoch_ns or 0)
-        yield Inputs(stamp, None, Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2)))
 
 
 def streams_of(control: RunControl, told: list[str], **device: Any) -> tuple[StreamInputs, Clock, RunLog]:

@@ -8,7 +8,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +25,7 @@ from flowrec.store.session import Session
 from flowrec.verbs.record import record
 from flowrec.verbs.replay_segments import verify
 from tests.extras import why
+from tests.real_time import Clock
 from tests.short_missions import SMALL
 
 pylsl = pytest.importorskip("pylsl", reason=why("pylsl"))
@@ -47,13 +47,6 @@ def outlet(name: str, *words: str) -> Iterator[subprocess.Popen[str]]:
         for pipe in (child.stdin, child.stdout):
             assert pipe is not None
             pipe.close()
-
-
-@dataclass
-class Clock:
-    """A rig whose stamp 0 is now."""
-
-    epoch_ns: int | None
 
 
 class Listening:
