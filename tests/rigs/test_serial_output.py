@@ -17,6 +17,7 @@ import serial
 from flowrec.core.errors import RigError, UsageError
 from flowrec.core.messages import SAMPLES, SILENT, STREAMS
 from flowrec.rigs.streams.log import RunLog
+from flowrec.rigs.streams.serial_output import SerialOutput, SerialOutputSettings
 from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import obey
 from flowrec.run.stream_inputs import StreamInputs
@@ -171,6 +172,21 @@ def test_a_device_that_is_unplugged_is_silent_and_ends_the_run_where_its_stream_
     assert states[-1].state[0] == SILENT and control.reason == "stream generator is silent"
     assert any("the device on" in line and "does not answer" in line for line in told), told
     assert sum("looked for again" in line for line in told) == 1, told
+
+
+def test_a_device_that_comes_back_gets_the_value_that_was_set_last() -> None:
+    device = Device()
+    settings = SerialOutputSettings(device.port, **GENERATOR)
+    output = SerialOutput("generator", ("volt", "hertz"), "", settings)
+    output.open()
+    output.set(0, 4.5)
+    output.read(0.0)
+    output.close()
+    assert device_has(device, "VOLT 0.00", "FREQ 1000000", last=2)  # at rest
+    device.lines.clear()
+    output.open()
+    assert device_has(device, "VOLT 4.50", "FREQ 1000000")
+    output.close()
 
 
 def test_a_port_that_another_has_opened_such_as_the_amplifier_gets_no_line() -> None:

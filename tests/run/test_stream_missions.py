@@ -50,6 +50,23 @@ def test_the_sensor_measures_the_true_pump_with_its_noise_and_nothing_else(flown
     assert measured.value[:40].mean() > 1.2 * measured.value[-40:].mean()  # the step
 
 
+def test_what_beads_tell_is_the_flow_at_the_nominal_pump_where_its_stream_is_followed(tmp_path: Path) -> None:
+    beads = ["tracker.tracers=true", "simulated.tracers=40", "tracker.tracer.stretch_radii=0.5"]
+    told = []
+    for number, follows in enumerate(([], ["pump.channel=pump/flow"])):
+        path = tmp_path / f"{number}.mcap"
+        record(load_config(None, [*SMALL, *PULSE, *PUMP, *beads, *follows]), path, duration_s=3.0)
+        with Session(path) as session:
+            told.append(list(session.ticks())[-1].tracer_flow)
+            pump = true_pump(session.config.simulated)
+    raw, nominal = told
+    assert raw is not None and nominal is not None and np.array_equal(raw.tracer, nominal.tracer)
+    shares = np.hypot(*raw.flow_um_s.T) / np.hypot(*nominal.flow_um_s.T)
+    true = np.array([pump.strength(float(time)) for time in raw.time_s])
+    assert len(shares) > 10 and np.ptp(true) > 0.3
+    assert np.median(np.abs(shares / true - 1.0)) < 0.06
+
+
 def test_a_replay_has_the_same_samples_at_the_same_ticks_and_is_identical(flown: Path, tmp_path: Path) -> None:
     assert verify(flown).identical
     assert replay_session(flown, verify=True, from_s=1.0).identical
