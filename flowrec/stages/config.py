@@ -174,6 +174,7 @@ _BEFORE: dict[str, Any] = {
     "health.step_out.learned": False,
     "sampler.without_map": False,
     "others.observe_flow": False,
+    "tracker.tracer.most_elongated": 0.0,
     "refine.place_robot": False,
     "refine.correct_robot": False,
     "refine.correct_heading": False,

@@ -1,8 +1,9 @@
 """Small round bodies in an image: local extrema of a difference of two blurs (Crocker and Grier 1996; Lowe 2004).
 
 A body of radius r is brightest in the difference of a Gaussian of sigma = r / sqrt(2) and one of 1.6 sigma. An extremum
-counts if it exceeds the noise of that difference, a median over the fluid, and is placed within the pixel by the
-parabola through its neighbours.
+counts if it exceeds the noise of that difference, a median over the fluid, and if the ratio of its principal curvatures
+is small: that of an edge, as of a wall, is large (Lowe 2004, section 4.1). The parabola through its neighbours places
+it within the pixel.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from flowrec.core import Bools, Floats, Image
+from flowrec.core import Bools, Floats, Image, Ints
 from flowrec.stages.vision.walls import Walls
 
 _WIDER = 1.6  # of the two blurs
@@ -31,6 +32,7 @@ class SpotSearch:
     radius_px: float
     dark: bool  # relative to the background
     least_snr: float  # of its contrast in the difference, over the noise
+    most_elongated: float = 0.0  # largest ratio of the principal curvatures; 0: any
 
     @property
     def sigma_px(self) -> float:
@@ -62,12 +64,27 @@ class SpotSearch:
         peaks &= (contrast > self.least_snr * noise) & (distance > 0.5 * self.radius_px)
         peaks[[0, -1]] = peaks[:, [0, -1]] = False
         rows, columns = np.nonzero(peaks)
+        if self.most_elongated > 0.0:
+            round_ones = _elongation(contrast, rows, columns) <= self.most_elongated
+            rows, columns = rows[round_ones], columns[round_ones]
         here = contrast[rows, columns]
         x = columns + _vertex(contrast[rows, columns - 1], here, contrast[rows, columns + 1]) + left
         y = rows + _vertex(contrast[rows - 1, columns], here, contrast[rows + 1, columns]) + top
         px, snr = np.column_stack((x, y)).astype(np.float64), here.astype(np.float64) / noise
         ring = _on_ring(px, snr, _RING_RADII * self.radius_px + _RING_PX)
         return px[~ring], snr[~ring]
+
+
+def _elongation(contrast: Image, rows: Ints, columns: Ints) -> Floats:
+    """Ratio of the principal curvatures at maxima, at least 1; infinite where it is flat along a line."""
+    around = [[contrast[rows + y, columns + x].astype(np.float64) for x in (-1, 0, 1)] for y in (-1, 0, 1)]
+    here = 2.0 * around[1][1]
+    xx, yy = here - around[1][0] - around[1][2], here - around[0][1] - around[2][1]
+    xy = 0.25 * (around[0][2] + around[2][0] - around[0][0] - around[2][2])
+    apart = np.hypot(0.5 * (xx - yy), xy)
+    middle = 0.5 * (xx + yy)
+    least = middle - apart
+    return np.where(least > 0.0, (middle + apart) / np.where(least > 0.0, least, 1.0), np.inf)
 
 
 def _on_ring(px: Floats, snr: Floats, within_px: float) -> Bools:

@@ -64,6 +64,9 @@ class TracerTracker:
     radius_um: Annotated[float, Range(0.1, 1e4)] | None = None
     look: Literal["dark", "bright"] = "dark"  # brightness of the tracers relative to the background
     least_snr: Annotated[float, Range(1.0, 1e3)] = 6.0  # contrast of a tracer over the noise of the filtered image
+    # largest ratio of the principal curvatures of a spot, which the edges of walls exceed; 0: any. It is 1.8 of a disc
+    # that moves by its diameter while the image is exposed
+    most_elongated: Annotated[float, Range(0.0, 1e3)] = 3.0
     keep_s: Annotated[float, Range(0.0, 60.0)] = 0.3  # time for which a tracer that is not seen is kept
     # length of the stretch over which the velocity of a tracer is one observation of the flow, in robot radii
     stretch_radii: Annotated[float, Range(0.1, 100.0)] = 1.0
@@ -72,7 +75,7 @@ class TracerTracker:
     def search(self, um_per_px: float, robot: Robot) -> SpotSearch:
         """The search for spots in an image of this scale."""
         radius_um = _RADIUS_SHARE * robot.radius_um if self.radius_um is None else self.radius_um
-        return SpotSearch(radius_um / um_per_px, self.look == "dark", self.least_snr)
+        return SpotSearch(radius_um / um_per_px, self.look == "dark", self.least_snr, self.most_elongated)
 
     def follow(
         self,

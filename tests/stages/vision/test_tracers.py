@@ -115,6 +115,17 @@ def test_the_faint_ring_of_a_body_is_no_body() -> None:
     assert np.rint(found.position_um[:, 0] / UM).tolist() == [50.0, 120.0], "it is one where it is alone"
 
 
+def test_the_edge_of_a_wall_that_the_mask_does_not_have_is_no_body_and_a_body_beside_it_is_one() -> None:
+    light = frame(np.array([[80.0, 60.0], [40.0, 48.0]]), 0).image.astype(float)
+    edge = 34.0 + 0.06 * np.arange(MASK.shape[1])  # a line two pixels wide, along which noise makes maxima
+    light -= 60.0 * np.exp(-((np.arange(MASK.shape[0])[:, None] - edge) ** 2) / 2.0)
+    shown = Frame(0, 0, np.clip(light, 0, 255).astype(np.uint8))
+    found = TRACKER.follow(None, None, shown, CHIP, CALIBRATION, ROBOT)
+    assert np.hypot(*(found.position_um / UM - [[40.0, 48.0], [80.0, 60.0]]).T).max() < 0.5
+    as_before = replace(TRACKER, most_elongated=0.0).follow(None, None, shown, CHIP, CALIBRATION, ROBOT)
+    assert as_before.count > 10
+
+
 def test_groups_are_assigned_as_all_bodies_at_once_would_be() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
