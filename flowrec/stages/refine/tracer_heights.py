@@ -26,7 +26,7 @@ VARIES_SHARE = 0.1
 # Pixels of the mask from a wall: nearer to it than walls may be off, a predicted speed says nothing of a tracer's.
 LEAST_PX = 2.0
 _HEIGHTS = 400  # of half a channel, by which quantiles of c are known to 0.5 %
-MOST = 100  # of all tracers, the latest first: the time of a refinement grows with the square
+MOST = 60  # observations of all tracers: the time of a refinement grows with the square
 
 
 def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -> Observations:
@@ -52,11 +52,15 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
 
 
 def _few_of_each(tracer: Floats) -> Ints:
-    """(k,) indices of the observations of the robot, then of the latest tracers, evenly along the way of each."""
+    """(k,) indices of the observations of the robot, then of the longest ways of tracers, evenly along each.
+
+    A way of few stretches is often that of no body, or of parts of two. Of ways of the same length the latest are taken.
+    """
+    numbers, ways = np.unique(tracer[tracer >= 0.0], return_counts=True)
+    longest = np.argsort(ways, kind="stable")[::-1][:MOST]
+    each = min(max(MOST // max(len(longest), 1), 1), MOST_EACH)
     chosen = [np.flatnonzero(tracer < 0.0)]
-    numbers = np.unique(tracer[tracer >= 0.0])[-MOST:]
-    each = min(max(MOST // max(len(numbers), 1), 1), MOST_EACH)
-    for number in numbers:
+    for number in np.sort(numbers[longest]):
         own = np.flatnonzero(tracer == number)
         inner = (np.arange(min(each, len(own))) + 0.5) / min(each, len(own))
         chosen.append(own[(inner * len(own)).astype(np.intp)])

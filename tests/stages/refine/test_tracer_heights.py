@@ -77,6 +77,8 @@ def test_what_the_robot_observed_is_left_as_it_is_and_few_of_each_tracer_are_use
     assert found.only(slice(0, 7)).flow_um_s.tolist() == robot.flow_um_s.tolist()
     assert found.std_um_s[:7].tolist() == robot.std_um_s.tolist()
     assert len(found.std_um_s) == 7 + MOST and found.tracer.max() == 199.0, "the latest"
+    short = np.flatnonzero((beads.tracer < 150.0) | (np.arange(2000) % 10 == 0))  # of the last 50 one stretch each
+    assert at_mean_height(beads.only(short), ASSUMED, DUCT).tracer.max() < 150.0, "the longest"
     few = at_mean_height(of_beads(3, 1, each=40), ASSUMED, DUCT)
     assert np.bincount(few.tracer.astype(int)).tolist() == [MOST_EACH] * 3
     assert at_mean_height(robot, ASSUMED, DUCT) is robot and robot.with_tracers(None) is robot
