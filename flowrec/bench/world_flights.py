@@ -19,17 +19,42 @@ from flowrec.bench.harness import flow_scores
 from flowrec.bench.null_models import NULL_MODELS, NullModel
 from flowrec.bench.planted_causes import count_causes, planted_causes
 from flowrec.bench.second_worlds import SECOND_WORLDS, make_survey
-from flowrec.core import BY_FIELD, Floats, FlowField, FlowrecError, Phase, Tick, WorkOrder, message_fields, seconds
+from flowrec.core import (
+    BY_FIELD,
+    NO_EXTRA,
+    Floats,
+    FlowField,
+    FlowrecError,
+    Observations,
+    Phase,
+    Tick,
+    WorkOrder,
+    message_fields,
+    seconds,
+)
 from flowrec.physics import Chip, load_chip
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, run, work
-from flowrec.stages import Pipeline, ResolvedConfig, assemble, calibration_of, load_config, resolve
+from flowrec.stages import (
+    Pipeline,
+    ResolvedConfig,
+    assemble,
+    calibration_of,
+    load_config,
+    observations_of_others,
+    observations_topic,
+    resolve,
+)
 from flowrec.verbs import refuse_adrift
 
 # Messages of a work order that are kept; the assumed flow is solved again.
 _KEPT = ("mission", "estimate", "health", "observations", "tracer_flow")
-# Methods that are `assimilate` with a part of what was observed, where tracers were followed.
-OF_A_PART = {"robot_alone": "tracer_flow", "tracers_alone": "observations"}  # and what is left out
+_OTHERS = "others"  # and the observations of each of the other robots
+# Methods that are `assimilate` with a part of what was observed, where tracers or other robots were followed.
+OF_A_PART: Mapping[str, Mapping[str, Any]] = {  # and what is left out
+    "robot_alone": {"tracer_flow": None, "extra": NO_EXTRA},
+    "tracers_alone": {"observations": None, "extra": NO_EXTRA},
+}
 _IN_FLIGHT = "assimilate"  # with which the robot navigates, whatever is compared
 
 
@@ -206,6 +231,8 @@ def fly(case: FlightCase) -> Flight:
     if orders:
         order = orders[-1]
         flight.order = {name: _as_json(getattr(order, name)) for name in _KEPT if getattr(order, name) is not None}
+        others = {observations_topic(number): _as_json(each) for number, each in observations_of_others(order).items()}
+        flight.order |= {_OTHERS: others} if others else {}
         flight.drift = rig.pump.mean_drift(seconds(order.stamp_ns))
     return flight
 
@@ -270,8 +297,7 @@ def _refine_order(order: Tick, pipeline: Pipeline, config: ResolvedConfig, chip:
         assert order.assumed is not None and order.observations is not None
         return NullModel(method).refine(order.assumed, order.observations, chip, pipeline.solver)
     if method in OF_A_PART:
-        left_out: dict[str, Any] = {OF_A_PART[method]: None}
-        order, method = replace(order, **left_out), _IN_FLIGHT
+        order, method = replace(order, **OF_A_PART[method]), _IN_FLIGHT
     refiner = replace(config.refine, method=method, adopt="always")
     result = work(replace(pipeline, refiner=refiner), order)
     assert isinstance(result, FlowField)
@@ -310,20 +336,24 @@ def _as_json(message: Any) -> dict[str, Any]:
 
 def _order_of(flight: Flight, pipeline: Pipeline) -> Tick:
     """The tick of the work order of a flight, with the assumed flow solved again."""
-    messages: dict[str, Any] = {}
-    for name, data in flight.order.items():
-        kind = BY_FIELD[name].type
-        arrays = {each.name for each in message_fields(kind) if each.dtype is not None}
-        values = {
-            key: np.reshape(value[1], value[0]) if key in arrays and value is not None else value
-            for key, value in data.items()
-        }
-        messages[name] = kind(**values)
-    tick = Tick(stamp_ns=messages["mission"].stamp_ns, **messages)
+    kept = dict(flight.order)
+    others = {path: _message(Observations, data) for path, data in kept.pop(_OTHERS, {}).items()}
+    messages = {name: _message(BY_FIELD[name].type, data) for name, data in kept.items()}
+    tick = Tick(stamp_ns=messages["mission"].stamp_ns, extra=NO_EXTRA.with_messages(others), **messages)
     solve = replace(messages["mission"], wanted=WorkOrder.SOLVE.value)
     assumed = work(pipeline, replace(tick, mission=solve))
     assert isinstance(assumed, FlowField)
     return replace(tick, assumed=assumed)
+
+
+def _message(kind: type, data: Mapping[str, Any]) -> Any:
+    """The message that `_as_json` gave."""
+    arrays = {each.name for each in message_fields(kind) if each.dtype is not None}
+    values = {
+        key: np.reshape(value[1], value[0]) if key in arrays and value is not None else value
+        for key, value in data.items()
+    }
+    return kind(**values)
 
 
 def as_line(flight: Flight) -> dict[str, Any]:

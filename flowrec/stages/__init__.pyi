@@ -56,6 +56,7 @@ from .planning.survey_design import (
 )
 from .robot_topics import (
     estimates_of_others as estimates_of_others, observations_of_others as observations_of_others,
+    observations_topic as observations_topic,
     robot_number as robot_number, robot_topic as robot_topic,
 )
 from .refine.case import Case as Case

@@ -31,6 +31,7 @@ from flowrec.stages.simulated_settings import Simulated
 
 TINY = ("camera.width_px=320", "camera.height_px=80", "mission.goal=[2400.0, 620.0]")
 CASE = FlightCase("slip", "straight", 3, TINY)
+SEVERAL = replace(CASE, sets=(*TINY, "tracker.robots=2", "simulated.robots=2"))
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +68,17 @@ def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(f
     json.dumps(found)
     worlds.show(found)
     assert "slip" in capsys.readouterr().out
+
+
+@pytest.mark.slow("a flight of two robots and its refinements, again from what was kept")
+def test_what_another_robot_observed_is_kept_and_left_out_where_one_robot_alone_is_asked_for():
+    flight = fly(SEVERAL)
+    assert list(flight.order["others"]) == ["/robot/1/observations"]
+    kept = worlds.Flight.of(json.loads(json.dumps(worlds.as_line(flight))))
+    refine(kept, ["assimilate", "robot_alone"])
+    del flight.order["others"]
+    refine(flight, ["assimilate"])
+    assert kept.refined["robot_alone"] == flight.refined["assimilate"] != kept.refined["assimilate"]
 
 
 def test_every_world_can_be_made_and_a_fault_is_as_large_as_its_name_says():

@@ -54,7 +54,7 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
 def _few_of_each(tracer: Floats) -> Ints:
     """(k,) indices of the observations of the robot, then of the longest ways of tracers, evenly along each.
 
-    A way of few stretches is often that of no body, or of parts of two. Of ways of the same length the latest are taken.
+    A way of few stretches is often that of no body, or of parts of two. Of ways as long as each other the latest count.
     """
     numbers, ways = np.unique(tracer[tracer >= 0.0], return_counts=True)
     longest = np.argsort(ways, kind="stable")[::-1][:MOST]
