@@ -172,6 +172,7 @@ _BEFORE: dict[str, Any] = {
     "plan.policy_points_per_radius": 3.0,
     "plan.policy_points_per_px": 4,
     "health.step_out.learned": False,
+    "health.step_out.least_gain": -0.5,
     "sampler.without_map": False,
     "others.observe_flow": False,
     "tracker.tracer.most_elongated": 0.0,

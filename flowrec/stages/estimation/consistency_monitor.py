@@ -18,7 +18,8 @@ first, therefore
 
 - the missing distance, as a mean over `window_s` at a high frequency, must exceed what the map's error can explain;
 - after the frequency was lowered, a robot that had stepped out rolls faster, while one in a flow that differs from the
-  map rolls slower in proportion. In the first case the limit stays for the rest of the run; in the second it is lifted.
+  map, or that an unknown wall holds back, rolls slower. In the first case the limit stays for the rest of the run; in
+  the second it is lifted.
 
 The limit follows from what was rolled: above its step-out frequency f_c a robot rolls, by Adler's equation, the part
 s = 1 - sqrt(1 - (f_c / f)^2) of what a field of frequency f asks for, so f_c = f sqrt(1 - (1 - s)^2).
@@ -50,9 +51,6 @@ from flowrec.physics import STEP_OUT, Robot, sample_as_seen
 
 _NONE = np.zeros(0)
 _SETTLED = 0.6  # fraction of the window's weight that must be present
-# Ratio of the speed gained to the speed taken off: positive for a robot that had stepped out, by the Adler equation,
-# and -1 for one in a flow that differs from the map. The threshold lies between the two.
-_IMPROVEMENT = -0.5
 _FREE_RADII = 1.3  # from a wall: nearer to it the robot may touch it or be slowed by it
 _HIGH = 0.5  # fraction of the frequency limit below which step-out is not looked for
 _FEWEST_FRAMES = 8  # in a window
@@ -68,6 +66,9 @@ class StepOut:
     window_s: Annotated[float, Range(0.05, 60.0)] = 0.5
     map_error: Share | None = None  # relative error of the map's flow; None: from the map
     missing_share: Share = 0.3  # fraction of the commanded motion that must be missing besides; 1: never limit
+    # speed gained over speed taken off, below which it was no step-out: 0.7 to 1.1 of robots that had stepped out in
+    # simulated flights, -0.3 to -0.5 of one that a wall held back, -1 in a flow that differs from the map
+    least_gain: Annotated[float, Range(-1.0, 1.0)] = 0.2
     learned: bool = True  # the limit is step_out_margin times what Adler's equation gives; False: lowered in steps
     lower_to: PositiveShare = 0.8  # factor on the frequency in one such step
     floor_share: PositiveShare = 0.3  # lowest limit, as a fraction of the robot's own
@@ -127,7 +128,7 @@ class StepOut:
         if time_s < _SETTLED * window_s or expected < _HIGH * limit_hz * robot.um_per_rev:
             return now
         if rolled_before.size:
-            if rolled - rolled_before[0] < _IMPROVEMENT * (rolled_before[1] - expected):
+            if rolled - rolled_before[0] < self.least_gain * (rolled_before[1] - expected):
                 return replace(now, rolled_sums=_NONE, limit_hz=None, limited_ns=now.stamp_ns, rolled_before_um_s=_NONE)
             now = replace(now, rolled_before_um_s=_NONE)
         waiting = now.limit_hz is None and limited_ns is not None and seconds(now.stamp_ns - limited_ns) < self.wait_s

@@ -40,10 +40,11 @@ def swum(
     wanted_hz: float = 24.0,
     wall_um: float = math.inf,
     later_hz: float | None = None,
+    share: float = 1.0,
 ) -> list[Health]:
     """Health on a straight way against a flow: the field turns as fast as wanted and allowed, the robot as it can.
 
-    `later_hz` is its step-out from 3 s on.
+    `later_hz` is its step-out from 3 s on, `share` what it rolls of what it should.
     """
     rng = np.random.default_rng(3)
     at, found, before = np.array([4000.0, 80.0]), list[Health](), None
@@ -53,7 +54,7 @@ def swum(
         frequency = min(wanted_hz, limit_hz)
         turns = np.array([-frequency * DT_S, 0.0])
         true_robot = replace(ROBOT, step_out_hz=later_hz if later_hz and index * DT_S >= 3.0 else step_out_hz)
-        at = at + DT_S * np.array([true_um_s - true_robot.rolled_speed_um_s(frequency), 0.0])
+        at = at + DT_S * np.array([true_um_s - share * true_robot.rolled_speed_um_s(frequency), 0.0])
         seen = at + rng.normal(0.0, 1.0, 2)
         estimate = Estimate(stamp, seen, np.zeros(2), np.eye(4), 2.0, seen, True)
         applied = Applied(stamp, frequency, math.pi, 4.0, np.zeros(3), turns, stamp)
@@ -100,6 +101,11 @@ def test_a_limit_that_does_not_help_is_lifted_and_not_tried_again_at_once() -> N
     told = [event_of(Tick(k - 1, health=found[k - 1]), Tick(k, health=found[k])) for k in (lowered, lifted)]
     assert told[0] is not None and told[0].level == "warning" and f"limited to {seen[1]:.1f} Hz" in told[0].text
     assert told[1] is not None and "no step-out" in told[1].text
+
+
+def test_the_limit_of_a_robot_that_a_wall_off_the_map_holds_back_is_lifted() -> None:
+    none, lowered, lifted = limits(swum(5.0, 200.0, 200.0, step_out_hz=28.8, share=0.4))
+    assert none is None and lowered is not None and lifted is None
 
 
 def test_a_robot_that_steps_out_at_ever_lower_frequencies_is_slowed_down_each_time_at_once() -> None:
