@@ -16,28 +16,20 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from flowrec.core import outside
-from flowrec.core.declarations import Message, Shape, Source, Topic, Vector
-from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import Applied, OperatorEvent
-from flowrec.core.topics import Tick
-from flowrec.exports import export
-from flowrec.exports.layout import write_layouts
-from flowrec.rigs.rig import increasing_stamps
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.streams import Streams
-from flowrec.stages.config import load_config
-from flowrec.stages.extra_topics import TOPIC_ROWS, ExtraRow, topics_of
-from flowrec.stages.inputs import Inputs
-from flowrec.stages.pipeline import Pipeline
-from flowrec.stages.rig_settings import RIGS
-from flowrec.store.session import Session
+from flowrec.core import Applied, Message, OperatorEvent, RigError, Source, Tick, Topic, UsageError, outside
+from flowrec.core.declarations import Shape, Vector
+from flowrec.exports import export, write_layouts
+from flowrec.rigs import SimulatedRig, increasing_stamps
+from flowrec.run import Streams
+from flowrec.stages import RIGS, ExtraRow, Inputs, Pipeline, load_config, topics_of
+from flowrec.stages.extra_topics import TOPIC_ROWS
+from flowrec.store import Session
+from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
 from flowrec.verbs.compare import compare
 from flowrec.verbs.record import record
 from flowrec.verbs.replay_segments import verify
-from flowrec.verbs.session_replay import replay_session
-from flowrec.view.bare_plots import plot_of
+from flowrec.view import plot_of
 from flowrec.view.foxglove_layout import foxglove_layout
 from tests.rewritten import rewrite
 from tests.short_missions import SMALL

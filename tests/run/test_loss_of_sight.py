@@ -10,13 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError
-from flowrec.core.messages import Applied, Currents, Event, Frame
-from flowrec.rigs.rig import checked_images
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.stages.config import load_config
-from flowrec.stages.inputs import Inputs
-from flowrec.store.reader import SessionReader
+from flowrec.core import Applied, Currents, Event, Frame, RigError
+from flowrec.rigs import SimulatedRig, checked_images
+from flowrec.stages import Inputs, load_config
+from flowrec.store import SessionReader
 from flowrec.verbs import session_replay as replay
 from flowrec.verbs.record import record
 from flowrec.verbs.run_summary import Recorded

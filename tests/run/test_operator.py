@@ -12,16 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.enums import Action
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.topics import Tick
-from flowrec.core.units import seconds
-from flowrec.run.control import RunControl
-from flowrec.run.disk_monitor import DiskMonitor, refuse_below
+from flowrec.core import Action, OperatorEvent, SessionError, Tick, seconds
+from flowrec.run import DiskMonitor, RunControl, refuse_below
 from flowrec.run.keyboard import Keyboard
-from flowrec.stages.config import load_config
-from flowrec.store.reader import SessionReader
+from flowrec.stages import load_config
+from flowrec.store import SessionReader
 from flowrec.verbs import record as verb
 from flowrec.verbs import session_replay as again
 from flowrec.verbs.auto_recovery import recover_leftovers

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import load_config
+from flowrec.core import UsageError
+from flowrec.physics import load_chip
+from flowrec.stages import commented_toml, load_config
 from flowrec.stages.resolve import resolve
-from flowrec.stages.setting_rows import commented_toml, setting_rows
+from flowrec.stages.setting_rows import setting_rows
 from flowrec.verbs.settings import settings
 
 ROWS = {row.key: row for row in setting_rows()}

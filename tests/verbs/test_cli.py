@@ -114,7 +114,7 @@ def test_sigterm_zeroes_the_coils_and_finishes_the_file(tmp_path: Path) -> None:
     assert not partial.exists()
     facts = json.loads(flowrec("info", out, "--json").stdout)["facts"]
     assert facts["outcome"].startswith("stopped")
-    from flowrec.store.reader import SessionReader
+    from flowrec.store import SessionReader
 
     reader = SessionReader(out)
     last = reader.tick_before(reader.last_ns)

@@ -12,13 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flowrec.core.diagnostics import CameraLosses
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import AS_STATED, ORIENTATIONS, Calibration, Orientation
+from flowrec.core import CameraLosses
+from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, ChipSettings, Orientation, load_chip
+from flowrec.rigs import CameraInfo
 from flowrec.rigs.lab.cameras import probe as camera
-from flowrec.rigs.lab.cameras.camera import CameraInfo
-from flowrec.stages.config import Config, load_config, registration_of, with_sets
+from flowrec.stages import Config, load_config, registration_of, with_sets
 from flowrec.stages.resolve import resolve
 from flowrec.verbs import diagnosis
 from flowrec.verbs.diagnosis import FAILURE, OK, WARNING, diagnose
