@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -31,6 +32,7 @@ from flowrec.verbs.record import record
 from flowrec.verbs.replay_segments import verify
 from flowrec.view import plot_of
 from flowrec.view.foxglove_layout import foxglove_layout
+from tests.conftest import made_once
 from tests.rewritten import rewrite
 from tests.short_missions import SMALL
 from tests.view.test_rrd import File
@@ -140,8 +142,9 @@ MISSION += [text for text in SMALL if not text.startswith("simulated.")]
 
 
 @pytest.fixture
-def flown(installed: Callable[[bool], None], tmp_path: Path) -> Path:
-    return record(load_config(None, MISSION), tmp_path / "a.mcap").path
+def flown(installed: Callable[[bool], None], tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = made_once(tmp_path_factory, "extra", lambda to: record(load_config(None, MISSION), to / "a.mcap").path)
+    return Path(shutil.copy(made, tmp_path))
 
 
 def test_a_mission_with_extra_inputs_and_an_extra_stage_is_replayed_exactly_and_read_without_the_package(
