@@ -45,6 +45,12 @@ SEEN = camera.CameraProbe(
 )
 
 
+@pytest.fixture(autouse=True)
+def short_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is tried with 4 MB."""
+    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+
+
 def levels(config: Config, folder: Path) -> dict[str, str]:
     order = [OK, WARNING, FAILURE]
     worst: dict[str, str] = {}
@@ -77,7 +83,6 @@ def test_what_a_camera_shows_is_judged(
     seen: camera.CameraProbe, what: str, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: seen)
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
     config = load_config(None, [*MEASURED, "mission.phases=observe"])
     assert levels(config, tmp_path)[what] == level
 
@@ -92,7 +97,6 @@ def test_a_chip_that_was_turned_since_its_registration_is_noticed(
     image = picture(chip.mask, chip.um_per_px, truth, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
     info = replace(SEEN.info, width_px=320, height_px=256)
     monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
     sets = ["camera.width_px=320", "camera.height_px=256", "mission.phases=observe"]
     assert levels(load_config(None, [*MEASURED, *sets]), tmp_path)["walls"] == level
 
@@ -115,7 +119,6 @@ def test_a_camera_that_shows_the_chip_in_another_orientation_is_a_failure_with_t
     image = picture(chip.mask, chip.um_per_px, true, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
     info = replace(SEEN.info, width_px=320, height_px=256)
     monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
     axes = {one.what: one for one in diagnose(config, folder=tmp_path)}["axes"]
     assert (axes.level == OK) == (orientation == AS_STATED)
     sets = [each.replace(" ", "") for each in axes.text.partition(": set ")[2].split(", ") if each]
@@ -132,16 +135,12 @@ def test_a_disk_is_judged_by_what_the_camera_delivers(
 
 
 @pytest.mark.slow("flies the rehearsal of a mission")
-def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path) -> None:
     told = {one.what: one.text for one in diagnose(load_config(), folder=tmp_path)}
     assert "mission with this configuration's methods went through" in told["kernels"]
 
 
-def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(tmp_path: Path) -> None:
     sets = [*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
     words = ["doctor", "--json", "--folder", str(tmp_path), *(word for text in sets for word in ("--set", text))]
     done = invoke(*words)
@@ -178,10 +177,7 @@ def test_a_registration_is_judged_by_its_age_and_its_residual(
     assert levels(load_config(None, sets), tmp_path)["registration"] == level
 
 
-def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_same(tmp_path: Path) -> None:
     devices = ["lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
     for wrong, text in {
         "robot.radius_um=-5.0": "robot.radius_um = -5",

@@ -30,7 +30,6 @@ from flowrec.store import (
     part_path,
     remote_file,
     session_sha256,
-    traffic,
 )
 from tests.conftest import HANG_S, invoke, until
 from tests.store.made_up import ticks_of
@@ -45,9 +44,7 @@ LARGE_PARTS = 4
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
-    monkeypatch.setattr(traffic, "_PAUSE_S", 0.01)
     monkeypatch.setattr(bucket_upload, "_PART_BYTES", PART_BYTES)
-    remote_file._remembered.clear()
     with s3_server(monkeypatch) as found:
         yield found
 
