@@ -22,8 +22,9 @@ from threadpoolctl import threadpool_limits
 from typer.testing import CliRunner, Result
 
 from flowrec.core.system.numba_setup import _cache_folder
-from flowrec.stages.config import load_config
-from flowrec.verbs.cli import app, main
+from flowrec.stages import load_config
+from flowrec.verbs import main
+from flowrec.verbs.cli import app
 from flowrec.verbs.record import record
 from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.core.messages import Applied
-from flowrec.stages.inputs import Inputs
+from flowrec.core import Applied
+from flowrec.stages import Inputs
 
 PERIOD_S = 1.0 / 30.0
 

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from flowrec.core.topics import TOPICS
+from flowrec.core import TOPICS
 from flowrec.store.digest import channel_digest, digest_record, head_digest, message_digest
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 

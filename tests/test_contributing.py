@@ -15,10 +15,7 @@ from numba.core.caching import _CacheLocator
 
 import flowrec
 from flowrec.core.system.numba_setup import _cache_folder, kernel_files
-from flowrec.stages.control.controller import CONTROLLERS
-from flowrec.stages.estimation.observer import OBSERVERS
-from flowrec.stages.planning.planner import PLANNERS
-from flowrec.stages.refine.refiner import REFINERS
+from flowrec.stages import CONTROLLERS, OBSERVERS, PLANNERS, REFINERS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(flowrec.__file__).parent  # where its kernels are compiled for

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import SessionError, UsageError
-from flowrec.core.topics import Tick
+from flowrec.core import SessionError, Tick, UsageError
 from tests.conftest import HANG_S, until
 from tests.short_missions import LONG, SMALL
 

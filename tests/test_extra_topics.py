@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,29 +17,22 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from flowrec.core import outside
-from flowrec.core.declarations import Message, Shape, Source, Topic, Vector
-from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import Applied, OperatorEvent
-from flowrec.core.topics import Tick
-from flowrec.exports import export
-from flowrec.exports.layout import write_layouts
-from flowrec.rigs.rig import increasing_stamps
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.streams import Streams
-from flowrec.stages.config import load_config
-from flowrec.stages.extra_topics import TOPIC_ROWS, ExtraRow, topics_of
-from flowrec.stages.inputs import Inputs
-from flowrec.stages.pipeline import Pipeline
-from flowrec.stages.rig_settings import RIGS
-from flowrec.store.session import Session
+from flowrec.core import Applied, Message, OperatorEvent, RigError, Source, Tick, Topic, UsageError, outside
+from flowrec.core.declarations import Shape, Vector
+from flowrec.exports import export, write_layouts
+from flowrec.rigs import SimulatedRig, increasing_stamps
+from flowrec.run import Streams
+from flowrec.stages import RIGS, ExtraRow, Inputs, Pipeline, load_config, topics_of
+from flowrec.stages.extra_topics import TOPIC_ROWS
+from flowrec.store import Session
+from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
 from flowrec.verbs.compare import compare
 from flowrec.verbs.record import record
 from flowrec.verbs.replay_segments import verify
-from flowrec.verbs.session_replay import replay_session
-from flowrec.view.bare_plots import plot_of
+from flowrec.view import plot_of
 from flowrec.view.foxglove_layout import foxglove_layout
+from tests.conftest import made_once
 from tests.rewritten import rewrite
 from tests.short_missions import SMALL
 from tests.view.test_rrd import File
@@ -148,8 +142,9 @@ MISSION += [text for text in SMALL if not text.startswith("simulated.")]
 
 
 @pytest.fixture
-def flown(installed: Callable[[bool], None], tmp_path: Path) -> Path:
-    return record(load_config(None, MISSION), tmp_path / "a.mcap").path
+def flown(installed: Callable[[bool], None], tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = made_once(tmp_path_factory, "extra", lambda to: record(load_config(None, MISSION), to / "a.mcap").path)
+    return Path(shutil.copy(made, tmp_path))
 
 
 def test_a_mission_with_extra_inputs_and_an_extra_stage_is_replayed_exactly_and_read_without_the_package(

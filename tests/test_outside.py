@@ -16,8 +16,8 @@ from unittest import mock
 import pyarrow.parquet
 import pytest
 
-from flowrec.stages.config import to_toml
-from flowrec.store.session import Session
+from flowrec.stages import to_toml
+from flowrec.store import Session
 from tests.conftest import needs_quiet
 from tests.rewritten import rewrite
 from tests.short_missions import SMALL

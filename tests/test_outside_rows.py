@@ -14,33 +14,34 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import pytest
 
-from flowrec.core import outside
-from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import Estimate, FlowField, Track
-from flowrec.core.ranges import Range, Seed, Share
-from flowrec.physics.chip.io import load_chip
+from flowrec.core import Estimate, FlowField, Range, RigError, Seed, Share, Track, UsageError, outside
+from flowrec.physics import load_chip
+from flowrec.rigs import Guardian, SimulatedRig, Wanted, probe_amplifier
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.cameras.camera import Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
-from flowrec.rigs.lab.drive import probe_amplifier
-from flowrec.rigs.lab.guardian import Guardian
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.stages.config import Config, config_from_toml, load_config, with_sets
-from flowrec.stages.control.controller import CONTROLLERS
-from flowrec.stages.control.field_rotation import FieldCommand
+from flowrec.stages import (
+    CONTROLLERS,
+    OBSERVERS,
+    PLANNERS,
+    REFINERS,
+    RIGS,
+    Config,
+    FieldCommand,
+    Kalman,
+    Observer,
+    Pipeline,
+    Tracker,
+    config_from_toml,
+    load_config,
+    with_row,
+    with_sets,
+)
 from flowrec.stages.control.tracking_laws import Reference, Situation, TrackingLaw, VectorLaw
-from flowrec.stages.estimation.kalman import Kalman
-from flowrec.stages.estimation.observer import OBSERVERS, Observer
-from flowrec.stages.outside_settings import with_row
-from flowrec.stages.pipeline import Pipeline
-from flowrec.stages.planning import PLANNERS
-from flowrec.stages.refine.refiner import REFINERS
 from flowrec.stages.resolve import resolve
-from flowrec.stages.rig_settings import RIGS
-from flowrec.stages.vision.tracker import TRACKERS, Tracker
-from flowrec.store.session import Session
+from flowrec.stages.vision.tracker import TRACKERS
+from flowrec.store import Session
+from flowrec.verbs import replay_session
 from flowrec.verbs.record import record
-from flowrec.verbs.session_replay import replay_session
 from tests.conftest import HANG_S
 from tests.outsider.pi_law import ProportionalIntegral  # noqa: F401 - named by an entry point
 from tests.outsider.vendor_camera import AcmeCamera

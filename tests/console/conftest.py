@@ -8,12 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Frame, Mission
-from flowrec.core.topics import Tick
-from flowrec.physics.chip.chip import Chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.robot import Robot
-from flowrec.view.scene import Scene
+from flowrec.core import Frame, Mission, Tick
+from flowrec.physics import Calibration, Chip, Robot
+from flowrec.view import Scene
 
 CALIBRATION = Calibration(2.5, (400.0, -100.0), 120.0, mirror=True)
 SIZE_PX = (640, 512)

@@ -12,10 +12,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from flowrec.console import console as console_module
-from flowrec.core.messages import OperatorEvent
-from flowrec.run.control import RunControl
-from flowrec.run.operator_commands import obey
-from flowrec.view.scene import Scene
+from flowrec.core import OperatorEvent
+from flowrec.run import RunControl, obey
+from flowrec.view import Scene
 from tests.conftest import HANG_S
 
 sync_client = importlib.import_module("websockets.sync.client")

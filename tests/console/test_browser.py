@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.messages import OperatorEvent
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import calibration_of, load_config
+from flowrec.core import OperatorEvent
+from flowrec.physics import load_chip
+from flowrec.stages import calibration_of, load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store.reader import SessionReader
-from flowrec.store.session import Session
+from flowrec.store import Session, SessionReader
 from flowrec.verbs import session_replay as again
 from tests.conftest import HANG_S
 from tests.extras import why

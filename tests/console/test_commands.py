@@ -14,11 +14,9 @@ import pytest
 from flowrec.console.app import application
 from flowrec.console.board import NOTHING, Board
 from flowrec.console.console import CommandReply
-from flowrec.core.enums import Action
-from flowrec.core.messages import Event
-from flowrec.run.control import RunControl
-from flowrec.view.feed import Batch
-from flowrec.view.scene import Scene
+from flowrec.core import Action, Event
+from flowrec.run import RunControl
+from flowrec.view import Batch, Scene
 from tests.conftest import until
 from tests.console.served import Served, answers_to, events_of
 

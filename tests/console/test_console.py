@@ -16,18 +16,14 @@ import numpy as np
 import psutil
 import pytest
 
+from flowrec.console import RunEnded
 from flowrec.console import console as console_module
 from flowrec.console.board import MOST_PAGES
-from flowrec.console.console import RunEnded
 from flowrec.console.page_state import PageState
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import WALLS, Estimate, FlowField, RobotWalls, Track
-from flowrec.core.topics import Extra, Tick
-from flowrec.run.operator_commands import COMMANDS
+from flowrec.core import WALLS, Estimate, Extra, FlowField, RobotWalls, Tick, Track, UsageError
+from flowrec.run import COMMANDS
 from flowrec.stages.robot_topics import messages_of
-from flowrec.view.feed import Batch
-from flowrec.view.live import LiveView
-from flowrec.view.scene import Scene
+from flowrec.view import Batch, LiveView, Scene
 from tests.conftest import until
 from tests.console.served import Served, asked
 

@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from flowrec.core.interpolation import (
-    bilinear,
-    bilinear_known,
-    cell_at,
-    cells_at,
-    corner_weights,
-    nearest_pixel,
-    nearest_pixels,
-)
+from flowrec.core import bilinear, bilinear_known, cell_at, cells_at, corner_weights, nearest_pixel, nearest_pixels
 
 RNG = np.random.default_rng(3)
 RASTER = RNG.normal(size=(7, 11))  # not square: a transposed index shows

@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.declarations import Message, as_read, invalid_numbers, message_fields
-from flowrec.core.errors import NotFiniteError
-from flowrec.core.topics import TOPICS, Tick
-from flowrec.store.reader import SessionReader
+from flowrec.core import TOPICS, Message, NotFiniteError, Tick, as_read, invalid_numbers, message_fields
+from flowrec.store import SessionReader
 from tests.store.drafts import made_up
 from tests.store.made_up import decode, encode
 

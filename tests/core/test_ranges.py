@@ -10,11 +10,11 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import Config, load_config, with_sets
+from flowrec.core import UsageError
+from flowrec.physics import load_chip
+from flowrec.stages import Config, load_config, with_sets
 from flowrec.stages.resolve import resolve
-from flowrec.store.session import Session
+from flowrec.store import Session
 from flowrec.verbs import session_replay as replay
 from tests.conftest import run
 

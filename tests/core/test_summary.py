@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from flowrec.core.summary import Value, of_text, verdict_lines, way_text, with_micro
-from flowrec.store.reader import SessionReader
-from flowrec.store.session import Session
+from flowrec.core import Value, of_text, verdict_lines, way_text, with_micro
+from flowrec.store import Session, SessionReader
 from tests.conftest import run
 from tests.short_missions import SMALL
 

@@ -9,11 +9,22 @@ import numpy as np
 import pytest
 from typing_extensions import TypeAliasType
 
-from flowrec.core.declarations import Message, Role, Shape, SlowStage, Source, Topic, Vector, message_fields
-from flowrec.core.enums import WorkOrder
-from flowrec.core.messages import Track
-from flowrec.core.topics import BY_FIELD, WORKER_FIELDS, Tick, stale_results, topics_of
-from flowrec.stages.config import Config
+from flowrec.core import (
+    BY_FIELD,
+    WORKER_FIELDS,
+    Message,
+    Role,
+    Source,
+    Tick,
+    Topic,
+    Track,
+    WorkOrder,
+    message_fields,
+    stale_results,
+)
+from flowrec.core.declarations import Shape, SlowStage, Vector
+from flowrec.core.topics import topics_of
+from flowrec.stages import Config
 
 
 @dataclass(frozen=True, slots=True, eq=False)

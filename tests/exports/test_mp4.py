@@ -15,12 +15,10 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Applied, Frame
-from flowrec.core.topics import Tick
+from flowrec.core import Applied, Frame, SessionError, Tick
 from flowrec.exports import mp4
 from flowrec.exports.camera_images import with_images
-from flowrec.view.status_bar import state_text
+from flowrec.view import state_text
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 STAMPS_NS = [0, 33_333_333, 66_666_667, 500_000_001, 533_333_333]  # one interval is a loss
@@ -157,8 +155,7 @@ def test_the_robot_is_in_its_ring_and_nothing_is_drawn_over_it(session, tmp_path
 def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_that_was_found(session):
     from dataclasses import replace
 
-    from flowrec.view.overlay import Overlay
-    from flowrec.view.scene import Scene
+    from flowrec.view import Overlay, Scene
 
     tick = replace(session.at(5.0), estimate=None)
     grey = np.full(tick.frame.image.shape, 100, np.uint8)
@@ -181,9 +178,8 @@ def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_
 def test_route_goal_and_robot_are_where_a_shaken_image_shows_them(session):
     from dataclasses import replace
 
-    from flowrec.core.messages import Shift
-    from flowrec.view.overlay import Overlay
-    from flowrec.view.scene import Scene
+    from flowrec.core import Shift
+    from flowrec.view import Overlay, Scene
 
     at_rest = replace(session.at(5.0), shift=None)
     grey = np.full(at_rest.frame.image.shape, 100, np.uint8)

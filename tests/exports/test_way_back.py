@@ -12,12 +12,12 @@ import pytest
 import tifffile
 
 import flowrec
-from flowrec.core.errors import MovieError
+from flowrec.core import MovieError
 from flowrec.movies import open_movie
-from flowrec.rigs.movie.rig import MovieRig, fitted_to_movie
-from flowrec.stages.config import Config, to_toml
+from flowrec.rigs import MovieRig, fitted_to_movie
+from flowrec.stages import Config, to_toml
+from flowrec.verbs import prepare
 from flowrec.verbs.align import asked_import, fit_import
-from flowrec.verbs.preparation import prepare
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import MovieError
+from flowrec.core import MovieError
+from flowrec.movies import MovieFacts
 from flowrec.movies.frame_times import frame_times
-from flowrec.movies.movie import MovieFacts
 
 MOVIE = Path("a.tif")
 

@@ -12,12 +12,11 @@ import pytest
 import tifffile
 import zstandard
 
-from flowrec.core.errors import MovieError
+from flowrec.core import MovieError
 from flowrec.movies import ReadOptions, ome, open_movie
-from flowrec.rigs.movie.rig import MovieRig
-from flowrec.rigs.movie.source import MovieSource
+from flowrec.rigs import MovieRig, MovieSource
+from flowrec.stages import Coils
 from flowrec.stages.config import MovieSettings
-from flowrec.stages.control import Coils
 from tests.extras import needs
 from tests.movies import makers
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import flowrec
-from flowrec.store.session import Session
+from flowrec.store import Session
 from tests.outlets import primes
 
 

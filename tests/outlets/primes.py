@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec.core.diagnostics import CameraLosses, Timing
-from flowrec.core.messages import (
+from flowrec.core import (
+    MCAP,
     Applied,
+    CameraLosses,
     Currents,
     Demand,
     Estimate,
@@ -23,15 +24,15 @@ from flowrec.core.messages import (
     Health,
     Mission,
     Observations,
+    Output,
     Route,
+    Tick,
+    Timing,
     Track,
     Truth,
 )
-from flowrec.core.system.outputs import MCAP, Output
-from flowrec.core.topics import Tick
-from flowrec.physics.chip.chip import Chip, ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import ResolvedConfig, load_config
+from flowrec.physics import Chip, ChipSettings, load_chip
+from flowrec.stages import ResolvedConfig, load_config
 from flowrec.stages.resolve import resolve
 from flowrec.store.session_writer import session_writer
 

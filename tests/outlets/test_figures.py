@@ -13,12 +13,11 @@ from matplotlib import pyplot
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from flowrec.exports.report import style
-from flowrec.exports.report.curve_figures import MotionFigure, PathFlowFigure
-from flowrec.exports.report.map_figure import MapFigure, _panels
-from flowrec.exports.report.path_figure import PathFigure, scale_bar
-from flowrec.exports.report.report_data import ReportData, picture_of
-from flowrec.store.session import Session
+from flowrec.exports import MapFigure, MotionFigure, PathFigure, PathFlowFigure, ReportData, style
+from flowrec.exports.report.map_figure import _panels
+from flowrec.exports.report.path_figure import scale_bar
+from flowrec.exports.report.report_data import picture_of
+from flowrec.store import Session
 from tests.outlets import primes as p
 
 WIDE_MM = 180.0

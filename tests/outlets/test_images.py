@@ -9,10 +9,10 @@ import pytest
 import tifffile
 
 import flowrec
-from flowrec.core.errors import SessionError
+from flowrec.core import SessionError
 from flowrec.exports.camera_images import image_stamps
 from flowrec.movies import open_movie
-from flowrec.store.session import Session
+from flowrec.store import Session
 from tests.movies import makers
 from tests.outlets import primes as p
 

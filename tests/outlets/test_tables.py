@@ -12,8 +12,8 @@ import pytest
 import xarray
 
 import flowrec
-from flowrec.core.errors import UsageError
-from flowrec.store.session import Session
+from flowrec.core import UsageError
+from flowrec.store import Session
 from tests.outlets import primes as p
 
 # By table: the columns, each with its unit and its value in the last row; {} stands for x, y and z, a column each.
@@ -149,7 +149,7 @@ def test_the_observed_flow_has_a_row_for_each_observation_and_is_read_back_as_it
 
 
 def test_a_persons_table_without_deviations_counts_each_at_a_twentieth_of_the_usual_speed() -> None:
-    from flowrec.store.table_columns import observations_of
+    from flowrec.store import observations_of
 
     table = {"x_um": [1.0, 2.0], "y_um": [3.0, 4.0], "u_um_s": [30.0, 0.0], "v_um_s": [40.0, 50.0]}  # 50 um/s each
     np.testing.assert_allclose(observations_of(table).std_um_s, 2.5)

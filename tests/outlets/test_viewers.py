@@ -15,14 +15,11 @@ from mcap.reader import make_reader
 from rerun.chunk import RrdReader
 
 import flowrec
-from flowrec.core.messages import FlowField
-from flowrec.core.topics import Tick
-from flowrec.physics.chip.registration import Calibration
-from flowrec.store.session import Session
-from flowrec.view import colours
+from flowrec.core import FlowField, Tick
+from flowrec.physics import Calibration
+from flowrec.store import Session
+from flowrec.view import Overlay, Scene, colours
 from flowrec.view.foxglove_layout import foxglove_layout
-from flowrec.view.overlay import Overlay
-from flowrec.view.scene import Scene
 from tests.outlets import primes as p
 from tests.rewritten import parser_of
 
@@ -312,7 +309,7 @@ def runs_of(picture: np.ndarray) -> list[int]:
 
 
 def test_a_scale_bar_of_the_movie_is_as_long_as_it_says(scene: Scene, tmp_path: Path) -> None:
-    from flowrec.view.status_bar import length_text
+    from flowrec.view import length_text
 
     picture = drawn(Overlay(scene, IMAGE_PX), Tick(p.FIRST_NS))[IMAGE_PX[1] :]
     assert length_text(100.0) == "100 µm"

@@ -14,13 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core import outside
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import SAMPLES, SILENT, STREAMS
-from flowrec.run.control import RunControl
-from flowrec.run.stream_inputs import StreamInputs
-from flowrec.stages.config import load_config
-from flowrec.stages.stream_settings import STREAM_KINDS
+from flowrec.core import SAMPLES, SILENT, STREAMS, UsageError, outside
+from flowrec.run import RunControl, StreamInputs
+from flowrec.stages import STREAM_KINDS, load_config
 from tests.real_time import Clock, ticks
 
 pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")

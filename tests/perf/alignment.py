@@ -17,13 +17,9 @@ from numpy.typing import NDArray
 
 import flowrec
 from flowrec.bench.harness import Results, run
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import FlowField
-from flowrec.core.terminal import progress, table
-from flowrec.core.units import NS_PER_S, nanoseconds
-from flowrec.measure.calibrate_motion import ANYWHERE, fit_log
-from flowrec.stages.config import load_config
-from flowrec.stages.control.field_log import FieldLog
+from flowrec.core import NS_PER_S, FlowField, UsageError, nanoseconds, progress, table
+from flowrec.measure import ANYWHERE, fit_log
+from flowrec.stages import FieldLog, load_config
 from flowrec.verbs.record import record
 
 Floats = NDArray[np.float64]

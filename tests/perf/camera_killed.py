@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec.physics.chip.io import load_chip
-from flowrec.rigs.emulated.world import emulated_world
-from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import assemble
+from flowrec.physics import load_chip
+from flowrec.rigs import emulated_world
+from flowrec.stages import assemble, load_config
 from flowrec.stages.resolve import resolve
 from tests.twins.coils import device
 from tests.twins.gige import Aravis, port

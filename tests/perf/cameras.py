@@ -25,14 +25,14 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.clocks.device_clock import envelope
-from flowrec.core.units import NS_PER_S
-from flowrec.rigs.lab.cameras.camera import Camera, Grabbed, Wanted
+from flowrec.core import NS_PER_S, envelope
+from flowrec.rigs import Grabbed, Wanted
+from flowrec.rigs.lab.cameras.camera import Camera
 from flowrec.rigs.lab.cameras.genicam import GenicamCamera
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from flowrec.rigs.lab.cameras.mmcore import MmcoreCamera
 from flowrec.rigs.lab.cameras.pylon import PylonCamera
-from flowrec.store.session import Session
+from flowrec.store import Session
 from tests.perf.camera_killed import trial
 from tests.perf.guardian import busy
 from tests.rigs.lab.cameras.watching import adds_up

@@ -25,11 +25,8 @@ from flowrec.archive.catalog.find import find
 from flowrec.archive.catalog.format import NAME
 from flowrec.archive.catalog.refresh import refresh
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.terminal import progress
-from flowrec.store.session import Session
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import OperatorEvent, progress
+from flowrec.store import Session, SessionWriter, WriterOptions
 
 SOURCE = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
 QUERIES = (

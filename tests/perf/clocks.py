@@ -16,8 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from flowrec.bench.harness import Results, Seed, print_rows, run
-from flowrec.core.clocks.device_clock import DeviceClock, Fit
-from flowrec.core.units import NS_PER_S
+from flowrec.core import NS_PER_S, DeviceClock, Fit
 
 _RATE_HZ = 100.0
 _SKEW = 50e-6

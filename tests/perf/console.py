@@ -17,14 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
-from flowrec.core.system.processes import realtime_priority
-from flowrec.run.control import RunControl
-from flowrec.run.loop import Sink
-from flowrec.stages.config import load_config
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_writer import session_header
-from flowrec.store.writer import SessionWriter
-from flowrec.verbs.preparation import prepare
+from flowrec.core import realtime_priority
+from flowrec.run import RunControl, Sink
+from flowrec.stages import load_config
+from flowrec.store import SessionWriter, WriterOptions, session_header
+from flowrec.verbs import prepare
 from flowrec.verbs.watching import Watching
 
 PAGE = """

@@ -27,7 +27,7 @@ import typer
 
 import flowrec
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.terminal import progress
+from flowrec.core import progress
 
 PACKAGE = Path(flowrec.__file__).parent
 ROOMS = "vision,estimation,planning,control,refine,flow"
@@ -88,13 +88,11 @@ def constants(rooms: list[str]) -> Iterator[Constant]:
 def fly() -> dict[str, Any]:
     """Measures of the flights with the package that is imported here, on one line of stdout."""
     from flowrec.bench.missions import MissionLog
-    from flowrec.physics.chip.io import load_chip
-    from flowrec.physics.flow.sampling import relative_rmse
-    from flowrec.rigs.simulated.rig import SimulatedRig
-    from flowrec.run.loop import run as fly_mission
-    from flowrec.run.workers import LockstepWorker
-    from flowrec.stages.config import load_config
-    from flowrec.stages.pipeline import assemble
+    from flowrec.physics import load_chip, relative_rmse
+    from flowrec.rigs import SimulatedRig
+    from flowrec.run import LockstepWorker
+    from flowrec.run import run as fly_mission
+    from flowrec.stages import assemble, load_config
     from flowrec.stages.resolve import resolve
 
     measures: dict[str, Any] = {}

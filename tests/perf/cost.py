@@ -19,8 +19,8 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.system.processes import child_command, child_environment, peak_mb
-from flowrec.core.terminal import progress
+from flowrec.core import peak_mb, progress
+from flowrec.core.system.processes import child_command, child_environment
 from tests.store.range_server import served
 
 _SECONDS_PER_YEAR = 365.25 * 24 * 3600

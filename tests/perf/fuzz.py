@@ -23,12 +23,8 @@ from typing import Annotated, Any
 import typer
 
 from flowrec.bench.harness import Results, Seed, run
-from flowrec.core.errors import FlowrecError, printable
-from flowrec.core.system.processes import forget_peak, peak_mb
-from flowrec.core.terminal import progress, table
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.session import Session
+from flowrec.core import FlowrecError, forget_peak, peak_mb, printable, progress, table
+from flowrec.store import Session, SessionReader, recover
 from flowrec.verbs.check import check
 from flowrec.verbs.info import info
 from flowrec.verbs.ls import ls

@@ -15,9 +15,8 @@ import typer
 
 from flowrec.bench.harness import Results, print_rows, run, vessel_cases
 from flowrec.bench.vessel_truth import read_true_chip, read_true_velocity
-from flowrec.core.errors import UsageError
-from flowrec.physics.chip.io import read_vessel_case
-from flowrec.physics.flow.solver import FlowSolver
+from flowrec.core import UsageError
+from flowrec.physics import FlowSolver, read_vessel_case
 from flowrec.stages.refine.discretisation_error import local_rms
 
 WITHIN_TWO = 0.9545  # of a Gaussian

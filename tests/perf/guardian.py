@@ -28,8 +28,8 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.terminal import progress
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.core import progress
+from flowrec.rigs import CommandLimits
 from tests.perf import guardian_record, guardian_trial
 from tests.twins.coils import Device, device
 from tests.twins.lab import still_scene

@@ -17,9 +17,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowrec.core.errors import FlowrecError
-from flowrec.store.recovery import NothingSavedError, recover
-from flowrec.store.session import Session
+from flowrec.core import FlowrecError
+from flowrec.store import Session, recover
+from flowrec.store.recovery import NothingSavedError
 from tests.twins.coils import Device
 from tests.twins.lab import COMMON, RATE, recorder
 
@@ -127,7 +127,7 @@ def _hold_when_told() -> None:
 
 
 if __name__ == "__main__":
-    from flowrec.verbs.cli import main
+    from flowrec.verbs import main
 
     threading.Thread(target=_hold_when_told, daemon=True).start()
     main()

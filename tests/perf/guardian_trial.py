@@ -13,15 +13,12 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from flowrec.core.errors import RigError
-from flowrec.core.messages import Currents
-from flowrec.core.system.processes import realtime_priority
-from flowrec.physics.robot import Robot
+from flowrec.core import Currents, RigError, realtime_priority
+from flowrec.physics import Robot
+from flowrec.rigs import CommandLimits
 from flowrec.rigs.lab.amplifiers.amplifier import Amplifier
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import BEAT_S, Drive
-from flowrec.stages.control.coils import Coils
-from flowrec.stages.rig_settings import OutputLimits
+from flowrec.stages import Coils, OutputLimits
 from tests.twins.coils import channels, sense_channels
 
 COILS = Coils(bias_mt=(0.05, 0.0, -0.04))

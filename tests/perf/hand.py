@@ -26,15 +26,13 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.core.terminal import table
-from flowrec.physics.chip.io import load_chip
-from flowrec.rigs.emulated.camera import EmulatedCamera
-from flowrec.rigs.emulated.world import emulated_world
-from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import assemble
+from flowrec.core import table
+from flowrec.physics import load_chip
+from flowrec.rigs import EmulatedCamera, emulated_world
+from flowrec.stages import assemble, load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store.reader import SessionReader
-from flowrec.verbs.session_replay import replay_session
+from flowrec.store import SessionReader
+from flowrec.verbs import replay_session
 from tests.conftest import HANG_S
 from tests.twins.coils import Device, device
 from tests.twins.lab import COMMON, PATIENT, words

@@ -23,10 +23,9 @@ import typer
 from mcap.records import Metadata
 
 from flowrec.bench.harness import Results, run
-from flowrec.core.terminal import progress, table
-from flowrec.core.topics import TOPICS
-from flowrec.core.units import NS_PER_S
-from flowrec.store.channels import FRAME_PATH, SLOTS, declarations
+from flowrec.core import NS_PER_S, TOPICS, progress, table
+from flowrec.store import FRAME_PATH, SLOTS
+from flowrec.store.channels import declarations
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.gathered_copies import gather

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 import flowrec
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.errors import FlowrecError
-from flowrec.core.messages import Track
-from flowrec.physics.flow.sampling import relative_rmse
-from flowrec.stages.config import load_config, with_sets
-from flowrec.store.session import Session
+from flowrec.core import FlowrecError, Track
+from flowrec.physics import relative_rmse
+from flowrec.stages import load_config, with_sets
+from flowrec.store import Session
 from flowrec.verbs.record import record
 from tests.movies import makers
 from tests.perf.movies import laboratory, write_table

@@ -20,11 +20,10 @@ import typer
 
 import flowrec
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.terminal import progress
-from flowrec.physics.chip.io import chip_files
-from flowrec.physics.flow.sampling import relative_rmse, sample
-from flowrec.stages.config import Config, load_config
-from flowrec.store.session import Session
+from flowrec.core import progress
+from flowrec.physics import chip_files, relative_rmse, sample
+from flowrec.stages import Config, load_config
+from flowrec.store import Session
 from flowrec.verbs.record import record
 from tests.movies import makers
 

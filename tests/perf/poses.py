@@ -8,9 +8,8 @@ import sys
 import time
 from pathlib import Path
 
-from flowrec.core.system.processes import peak_mb
-from flowrec.core.units import nanoseconds
-from flowrec.store.reader import SessionReader
+from flowrec.core import nanoseconds, peak_mb
+from flowrec.store import SessionReader
 
 
 def read(what: str, path: Path) -> dict[str, float]:

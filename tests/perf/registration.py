@@ -20,14 +20,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flowrec.core.errors import ChipError
+from flowrec.core import ChipError
 from flowrec.measure.picture_registration import register
-from flowrec.physics.chip.chip import Chip, ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import Calibration
+from flowrec.physics import Calibration, Chip, ChipSettings, load_chip
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.stages.rig_settings import CameraSettings
-from flowrec.stages.simulated_settings import SimulatedImage
+from flowrec.stages import CameraSettings, SimulatedImage
 from tests.physics.chip.looks import LOOKS, picture
 
 SIZE_PX, ABOUT_UM, CHIP_UM = (640, 512), 10.0, 20.0

@@ -13,8 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from flowrec.core import Tick, Truth
-from flowrec.core.errors import FlowrecError
+from flowrec.core import FlowrecError, Tick, Truth
 from flowrec.physics import load_chip
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, run

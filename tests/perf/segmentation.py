@@ -23,18 +23,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.errors import FlowrecError
+from flowrec.core import FlowrecError
 from flowrec.measure.segmentation import chip_mask, iou, segment
-from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.physics.chip.io import load_chip, without_pockets
-from flowrec.physics.chip.openings import check_openings, find_openings, guess_inlets
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.flow.sampling import sample
-from flowrec.physics.flow.solver import FlowSolver
+from flowrec.physics import (
+    WATER_KG_M3,
+    WATER_MPA_S,
+    Calibration,
+    Chip,
+    ChipSettings,
+    FlowSolver,
+    clearance_um,
+    find_openings,
+    guess_inlets,
+    load_chip,
+    sample,
+    without_pockets,
+)
+from flowrec.physics.chip.openings import check_openings
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.stages.rig_settings import CameraSettings
-from flowrec.stages.simulated_settings import SimulatedImage
+from flowrec.stages import CameraSettings, SimulatedImage
 from tests.physics.chip.looks import LOOKS, Look, picture
 
 MORE_LOOKS = {

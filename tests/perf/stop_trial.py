@@ -19,12 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec.core.errors import RigError
-from flowrec.core.messages import Currents
+from flowrec.core import Currents, RigError
+from flowrec.rigs import SimulatedRig
 from flowrec.rigs.simulated import rig as simulated
-from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run import loop
-from flowrec.stages.inputs import Inputs
+from flowrec.stages import Inputs
 from flowrec.verbs import cli
 from flowrec.verbs import mission_run as verb
 from tests.short_missions import SMALL

@@ -25,8 +25,8 @@ import typer
 
 from flowrec.bench.flow import make_up
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.terminal import progress
-from flowrec.store.session_metadata import SessionMetadata
+from flowrec.core import progress
+from flowrec.store import SessionMetadata
 
 ROOT = Path(__file__).parents[2]
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

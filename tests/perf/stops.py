@@ -20,10 +20,8 @@ from typing import Annotated
 import typer
 
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.errors import FlowrecError
-from flowrec.core.terminal import progress
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
+from flowrec.core import FlowrecError, progress
+from flowrec.store import SessionReader, recover
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGUSR1, signal.SIGUSR2]
 _RAMP_S, _HANG_S, _SIGHT_S = 0.9, 0.5, 1.4

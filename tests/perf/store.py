@@ -18,11 +18,8 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.terminal import progress
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import progress
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from tests.perf import store_equal
 from tests.perf.store_kills import kills
 from tests.perf.store_kills import show as show_kills

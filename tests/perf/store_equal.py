@@ -23,10 +23,7 @@ import zstandard
 from foxglove.mcap import MCAPCompression
 
 from flowrec.bench.harness import print_rows
-from flowrec.core.declarations import Message, message_fields
-from flowrec.core.messages import FlowField, Track
-from flowrec.core.system.processes import realtime_priority
-from flowrec.core.terminal import progress
+from flowrec.core import FlowField, Message, Track, message_fields, progress, realtime_priority
 from flowrec.run.loop import SWITCH_S
 from flowrec.store.channels import message_codec
 from flowrec.store.schema import Schema

@@ -17,17 +17,10 @@ from typing import Any
 import numpy as np
 
 from flowrec.bench.harness import print_rows
-from flowrec.core.declarations import Image
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.terminal import progress
-from flowrec.core.topics import Tick
-from flowrec.core.units import seconds
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.run_files import PARTIAL_SUFFIX, run_files
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import Image, OperatorEvent, SessionError, Tick, progress, seconds
+from flowrec.store import PARTIAL_SUFFIX, SessionReader, SessionWriter, WriterOptions, recover
+from flowrec.store.run_files import run_files
+from flowrec.store.session_file import Snapshot, Split
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _SHORTEST_S, _LONGEST_S = 0.1, 2.5

@@ -12,16 +12,12 @@ from typing import Any
 import numpy as np
 
 from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
-from flowrec.core.declarations import Image
-from flowrec.core.messages import Frame, OperatorEvent
-from flowrec.core.system.processes import peak_mb, realtime_priority
-from flowrec.core.terminal import progress
-from flowrec.core.topics import Tick
-from flowrec.run.loop import Sink
-from flowrec.stages.config import load_config
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.writer import SessionWriter
-from flowrec.verbs.preparation import prepare
+from flowrec.core import Frame, Image, OperatorEvent, Tick, peak_mb, progress, realtime_priority
+from flowrec.run import Sink
+from flowrec.stages import load_config
+from flowrec.store import SessionWriter, WriterOptions
+from flowrec.store.session_file import Snapshot, Split
+from flowrec.verbs import prepare
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _WIDTH, _HEIGHT = 2448, 2048

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.core.terminal import progress
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import load_config
+from flowrec.core import progress
+from flowrec.physics import load_chip
+from flowrec.stages import load_config
 from flowrec.stages.resolve import resolve
+from flowrec.store import SessionWriter, WriterOptions
 from flowrec.store.roi import Region
-from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_writer import region_of
-from flowrec.store.writer import SessionWriter
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _CAMERAS = ((640, 512, 100.0), (2448, 2048, 60.0))

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 import flowrec
-from flowrec.core.terminal import progress, table
-from flowrec.core.units import NS_PER_S
+from flowrec.core import NS_PER_S, progress, table
 
 _RATE_HZ = 60.0
 _VERIFIED_S = 180.0

@@ -13,13 +13,10 @@ from typing import Any
 import numpy as np
 
 from flowrec.bench.harness import print_rows
-from flowrec.core.declarations import Image
-from flowrec.core.messages import FlowField, OperatorEvent
-from flowrec.core.terminal import progress
-from flowrec.core.topics import Tick
+from flowrec.core import FlowField, Image, OperatorEvent, Tick, progress
 from flowrec.run.loop import SWITCH_S
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.store import SessionWriter, WriterOptions
+from flowrec.store.session_file import Snapshot, Split
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _RATE_HZ = 60.0

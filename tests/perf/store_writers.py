@@ -14,18 +14,13 @@ import numpy as np
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from mcap.writer import CompressionType, Writer
 
-from flowrec.core.declarations import Image, Message
-from flowrec.core.messages import Applied, Estimate, Frame, Track
-from flowrec.core.topics import BY_FIELD, Tick
-from flowrec.core.units import nanoseconds
-from flowrec.store.channels import SLOTS, declarations, message_codec
+from flowrec.core import BY_FIELD, Applied, Estimate, Frame, Image, Message, Tick, Track, nanoseconds
+from flowrec.store import SLOTS, SessionHeader, SessionWriter, WriterOptions
+from flowrec.store.channels import declarations, message_codec
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.schema import Schema
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_metadata import SessionHeader
-from flowrec.store.writer import SessionWriter
 from tests.store.made_up import encode
 
 _NOISE = 3.0  # grey levels, one sigma: a camera's at this brightness

@@ -17,12 +17,10 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from flowrec.core.messages import SAMPLES, STREAMS, Applied
-from flowrec.run.control import RunControl
+from flowrec.core import SAMPLES, STREAMS, Applied
+from flowrec.run import RunControl, StreamInputs
 from flowrec.run.loop import SWITCH_S
-from flowrec.run.stream_inputs import StreamInputs
-from flowrec.stages.inputs import Inputs
-from flowrec.stages.stream_settings import StreamSettings
+from flowrec.stages import Inputs, StreamSettings
 
 STREAMS_OF = {"slow": (1.0, 1), "usual": (100.0, 1), "fast": (1000.0, 1), "wide": (1000.0, 32)}
 PERIOD_S = 1.0 / 30.0

@@ -25,8 +25,8 @@ import typer
 
 from flowrec.archive.sweep.results import read_rows
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.system.processes import child_command, child_environment, pool
-from flowrec.core.terminal import progress
+from flowrec.core import pool, progress
+from flowrec.core.system.processes import child_command, child_environment
 from tests.short_missions import SMALL
 
 SETTINGS = ("fvm", "assimilate")
@@ -109,7 +109,7 @@ def measure(
 
 def _fly(mission: tuple[int, Path, float]) -> None:
     from flowrec.core import terminal
-    from flowrec.stages.config import load_config
+    from flowrec.stages import load_config
     from flowrec.verbs.record import record
 
     terminal.console.quiet = True

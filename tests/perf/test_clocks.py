@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from flowrec.core.clocks.device_clock import DeviceClock
+from flowrec.core import DeviceClock
 from tests.perf.clocks import CASES, measure, series
 
 FRAMES_PER_S = 100

@@ -2,7 +2,7 @@
 
 import pytest
 
-from flowrec.store.reader import SessionReader
+from flowrec.store import SessionReader
 from tests.perf.fuzz import Campaign
 
 # Seeds of files that were once a fault: what recovery passed for whole could not be read; a check that saw less than
@@ -40,7 +40,7 @@ def test_the_campaign_notices_what_may_not_happen(tmp_path, monkeypatch):
 
 
 def test_the_session_that_is_corrupted_holds_every_topic(tmp_path):
-    from flowrec.core.topics import TOPICS
+    from flowrec.core import TOPICS
     from tests.store.drafts import TICKS, small_draft
 
     path = tmp_path / "whole.mcap"

@@ -3,7 +3,7 @@
 import pytest
 
 from flowrec.bench.flow import make_up
-from flowrec.core.errors import UsageError
+from flowrec.core import UsageError
 from tests.perf import grid, large
 
 

@@ -22,11 +22,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.core.messages import Frame, Tracers
-from flowrec.core.units import nanoseconds
-from flowrec.physics.chip.chip import Chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.robot import Robot
+from flowrec.core import Frame, Tracers, nanoseconds
+from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.tracers import TracerTracker
 
 COUNTS = (1, 10, 100, 400)

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import Applied
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.robot import Robot
-from flowrec.stages.config import load_config
+from flowrec.core import Applied, UsageError
+from flowrec.physics import Robot, load_chip
+from flowrec.stages import load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store.reader import SessionReader
+from flowrec.store import SessionReader
 from flowrec.verbs.record import record
 from tests.conftest import invoke
 from tests.short_missions import SMALL

@@ -5,11 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from flowrec.core.messages import FlowField
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.robot import Robot
+from flowrec.core import FlowField
+from flowrec.physics import ChipSettings, Robot, clearance_um, load_chip
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.hindrance import (
     FLOOR_DRAG,
@@ -20,7 +17,7 @@ from flowrec.rigs.simulated.hindrance import (
     shear_mobility,
     walls_around,
 )
-from flowrec.stages.simulated_settings import Simulated
+from flowrec.stages import Simulated
 
 QUIET = Simulated(world="kind", position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
 RADIUS_UM, PX = 50.0, 20.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flowrec.core.messages import FlowField
-from flowrec.physics.robot import Robot
+from flowrec.core import FlowField
+from flowrec.physics import Robot
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.pump import Pump
-from flowrec.stages.simulated_settings import Simulated
+from flowrec.stages import Simulated
 
 
 def drifter(share: float) -> Swimmer:

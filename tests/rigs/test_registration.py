@@ -4,19 +4,14 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import ChipError
-from flowrec.core.interpolation import bilinear
-from flowrec.core.topics import Tick
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import calibration_of, load_config
+from flowrec.core import ChipError, Tick, bilinear
+from flowrec.physics import ChipSettings, clearance_um, load_chip
+from flowrec.stages import calibration_of, load_config, walls_in_view
 from flowrec.stages.control import axes_check
 from flowrec.stages.resolve import resolve
-from flowrec.stages.vision.walls import walls_in_view
 from flowrec.verbs.check import check
 from flowrec.verbs.record import record
-from flowrec.view.summary_text import rows_of_run
+from flowrec.view import rows_of_run
 from tests.short_missions import SMALL
 
 SURVEY = [*SMALL, "mission.phases=survey,refine"]

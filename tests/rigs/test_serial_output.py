@@ -14,14 +14,11 @@ import numpy as np
 import pytest
 import serial
 
-from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import SAMPLES, SILENT, STREAMS
-from flowrec.rigs.streams.log import RunLog
+from flowrec.core import SAMPLES, SILENT, STREAMS, RigError, UsageError
+from flowrec.rigs import RunLog
 from flowrec.rigs.streams.serial_output import SerialOutput, SerialOutputSettings
-from flowrec.run.control import RunControl
-from flowrec.run.operator_commands import obey
-from flowrec.run.stream_inputs import StreamInputs
-from flowrec.stages.config import load_config
+from flowrec.run import RunControl, StreamInputs, obey
+from flowrec.stages import load_config
 from tests.real_time import Clock, ticks
 
 pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")

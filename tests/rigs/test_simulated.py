@@ -6,18 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import ChipError, RigError, UsageError
-from flowrec.core.messages import Currents, FlowField
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.flow.solver import FlowSolver
-from flowrec.physics.robot import Robot
-from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.core import ChipError, Currents, FlowField, RigError, UsageError
+from flowrec.physics import Calibration, ChipSettings, FlowSolver, Robot, load_chip
+from flowrec.rigs import SimulatedRig
 from flowrec.rigs.simulated.world import true_chip
-from flowrec.stages.control import Coils
-from flowrec.stages.rig_settings import ResolvedCamera
-from flowrec.stages.simulated_settings import Simulated, SimulatedImage
+from flowrec.stages import Coils, ResolvedCamera, Simulated, SimulatedImage
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
 EXACT = Simulated(

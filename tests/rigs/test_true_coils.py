@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flowrec.rigs.simulated.world import TrueCoils
-from flowrec.stages.control import Coils
+from flowrec.stages import Coils
 from tests.rigs.test_simulated import EXACT, command, fly, rig_with
 
 WRONG = replace(EXACT, seed=4, coil_error=0.05)

@@ -8,25 +8,28 @@ import numpy as np
 import pytest
 import scipy
 
-from flowrec.core.messages import Currents, FlowField
-from flowrec.core.ranges import faults
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.clearance import clearance_um, median_width_um
-from flowrec.physics.chip.fluid import PowerLaw, ViscositySettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.flow.sampling import relative_rmse, sample
-from flowrec.physics.flow.solver import FlowSolver
-from flowrec.physics.robot import Robot
+from flowrec.core import Currents, FlowField, faults
+from flowrec.physics import (
+    Calibration,
+    ChipSettings,
+    FlowSolver,
+    PowerLaw,
+    Robot,
+    ViscositySettings,
+    clearance_um,
+    load_chip,
+    median_width_um,
+    relative_rmse,
+    sample,
+)
+from flowrec.rigs import SimulatedRig, true_depth_um, true_robot
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.pump import Pump
-from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.rigs.simulated.true_walls import at_centres, cut_up, true_walls
-from flowrec.rigs.simulated.world import Shake, misregister, true_chip, true_depth_um, true_pump, true_robot
-from flowrec.stages.config import config_from_toml, load_config, to_toml, with_sets
-from flowrec.stages.pipeline import assemble
-from flowrec.stages.resolve import derived_values, resolve
-from flowrec.stages.simulated_settings import WORLDS, Simulated
+from flowrec.rigs.simulated.world import Shake, misregister, true_chip, true_pump
+from flowrec.stages import Simulated, assemble, config_from_toml, derived_values, load_config, to_toml, with_sets
+from flowrec.stages.resolve import resolve
+from flowrec.stages.simulated_settings import WORLDS
 from tests.short_missions import SMALL
 
 CHIP = load_chip(ChipSettings("bifurcation"))

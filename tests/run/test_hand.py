@@ -10,21 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Currents, Hand, OperatorEvent
-from flowrec.core.topics import Tick
-from flowrec.core.units import seconds
-from flowrec.run.control import RunControl
+from flowrec.core import Currents, Hand, OperatorEvent, Tick, seconds
+from flowrec.run import RunControl, Watchdog, obey
 from flowrec.run.hand import SILENCE_S, HandSteering
-from flowrec.run.operator_commands import obey
-from flowrec.run.watchdog import Watchdog
-from flowrec.stages.config import load_config
-from flowrec.store.reader import SessionReader
-from flowrec.store.session import Session
+from flowrec.stages import load_config
+from flowrec.store import Session, SessionReader
 from flowrec.verbs import record as verb
+from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
 from flowrec.verbs.compare import compare
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.session_replay import replay_session
 from tests.conftest import until
 from tests.short_missions import SMALL
 

@@ -10,18 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import NotFiniteError
-from flowrec.core.messages import Estimate
-from flowrec.core.topics import Tick
-from flowrec.core.units import NS_PER_S
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.loop import run
-from flowrec.run.workers import LockstepWorker
-from flowrec.stages.config import load_config
-from flowrec.stages.estimation import Observer
-from flowrec.stages.pipeline import assemble
-from flowrec.store.reader import SessionReader
-from flowrec.verbs.preparation import prepare
+from flowrec.core import NS_PER_S, Estimate, NotFiniteError, Tick
+from flowrec.rigs import SimulatedRig
+from flowrec.run import LockstepWorker, run
+from flowrec.stages import Observer, assemble, load_config
+from flowrec.store import SessionReader
+from flowrec.verbs import prepare
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL
 

@@ -13,15 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError
-from flowrec.core.messages import HEARD, SAMPLES, SILENT, STREAMS, Applied, Samples, StreamStates
-from flowrec.rigs.streams.log import RunLog
-from flowrec.run.control import RunControl
-from flowrec.run.stream_inputs import StreamInputs
-from flowrec.stages.config import load_config
-from flowrec.stages.inputs import Inputs
-from flowrec.stages.stream_settings import StreamSettings
-from flowrec.store.session import Session
+from flowrec.core import HEARD, SAMPLES, SILENT, STREAMS, Applied, RigError, Samples, StreamStates
+from flowrec.rigs import RunLog
+from flowrec.run import RunControl, StreamInputs
+from flowrec.stages import Inputs, StreamSettings, load_config
+from flowrec.store import Session
 from flowrec.verbs.record import record
 from flowrec.verbs.replay_segments import verify
 from tests.extras import why

@@ -8,20 +8,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from flowrec.core.enums import Action
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.topics import Tick
-from flowrec.core.units import seconds
-from flowrec.run.control import RunControl
-from flowrec.run.disk_monitor import DiskMonitor, refuse_below
+from flowrec.core import Action, OperatorEvent, SessionError, Tick, seconds
+from flowrec.run import DiskMonitor, RunControl, refuse_below
 from flowrec.run.keyboard import Keyboard
-from flowrec.stages.config import load_config
-from flowrec.store.reader import SessionReader
+from flowrec.stages import load_config
+from flowrec.store import SessionReader
 from flowrec.verbs import record as verb
 from flowrec.verbs import session_replay as again
 from flowrec.verbs.auto_recovery import recover_leftovers
@@ -177,7 +173,7 @@ def test_below_its_floor_the_disk_ends_the_run_once_and_says_how_long_it_will_la
 ) -> None:
     left, written, told = [5_000_000_000], [0], []
     clock = iter((0.0, 1.0, 2.0))
-    monkeypatch.setattr("flowrec.run.disk_monitor.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("flowrec.run.disk_monitor.time", SimpleNamespace(monotonic=lambda: next(clock)))
     watch = DiskMonitor(tmp_path, lambda: written[0], 1.0, told.append, lambda _folder: left[0])
     assert not watch.sample()
     written[0] = 10_000_000

@@ -8,20 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.declarations import as_read
-from flowrec.core.errors import FlowrecError, NotFiniteError
-from flowrec.core.messages import Demand, Estimate, FlowField, Mission, Route
-from flowrec.core.topics import Tick
-from flowrec.physics.flow.solver import FlowSolver
-from flowrec.run.workers import work
-from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import Pipeline, assemble
-from flowrec.stages.planning import Planner, SurveyPlanner
-from flowrec.stages.refine import Refiner
+from flowrec.core import Demand, Estimate, FlowField, FlowrecError, Mission, NotFiniteError, Route, Tick, as_read
+from flowrec.physics import FlowSolver
+from flowrec.run import work
+from flowrec.stages import Pipeline, Planner, Refiner, SurveyPlanner, assemble, load_config
 from flowrec.stages.refine.obstacles import Likelihood
-from flowrec.store.reader import SessionReader
+from flowrec.store import SessionReader
+from flowrec.verbs import prepare
 from flowrec.verbs import session_replay as verb
-from flowrec.verbs.preparation import prepare
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL
 

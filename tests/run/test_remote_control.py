@@ -13,11 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.enums import Action
-from flowrec.core.errors import FlowrecError
-from flowrec.run import remote_control
-from flowrec.run.control import RunControl
-from flowrec.run.remote_control import CommandSocket, RemoteControl
+from flowrec.core import Action, FlowrecError
+from flowrec.run import CommandSocket, RemoteControl, RunControl, remote_control
 from tests.conftest import until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the folder of the sockets is looked at")

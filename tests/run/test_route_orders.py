@@ -5,11 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flowrec.core.enums import Phase
+from flowrec.core import Phase
 from flowrec.run.route_orders import route, survey_route
+from flowrec.stages import SurveyPlanner, no_route
 from flowrec.stages.estimation import Sampler
-from flowrec.stages.planning.route import no_route
-from flowrec.stages.planning.survey import SurveyPlanner
 from tests.stages.planning.worlds import robot
 
 NOWHERE = no_route("none", "")

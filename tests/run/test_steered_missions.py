@@ -10,18 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.system.outputs import MCAP, Output
-from flowrec.core.topics import Tick
-from flowrec.core.units import seconds
-from flowrec.run.control import RunControl
-from flowrec.stages.config import load_config
-from flowrec.store.reader import SessionReader
+from flowrec.core import MCAP, OperatorEvent, Output, Tick, seconds
+from flowrec.run import RunControl
+from flowrec.stages import load_config
+from flowrec.store import SessionReader
+from flowrec.verbs import Change, refly, replay_session
 from flowrec.verbs import record as verb
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.replay_change import Change
-from flowrec.verbs.replay_made import refly
-from flowrec.verbs.session_replay import replay_session
 from tests.short_missions import SMALL
 
 Script = tuple[tuple[float, Callable[[RunControl], object]], ...]

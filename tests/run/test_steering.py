@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from flowrec.core.enums import Action
-from flowrec.core.errors import UsageError
-from flowrec.run.control import LONGEST_TEXT, RunControl
+from flowrec.core import Action, UsageError
+from flowrec.run import RunControl
+from flowrec.run.control import LONGEST_TEXT
 
 TICK_NS = 20_000_000
 

@@ -16,15 +16,12 @@ from typing import Any, cast
 
 import pytest
 
-from flowrec.core.messages import OperatorEvent
-from flowrec.run.control import RunControl
-from flowrec.run.signals import Signals
-from flowrec.run.watchdog import Watchdog
-from flowrec.stages.config import load_config
-from flowrec.store.reader import SessionReader
+from flowrec.core import OperatorEvent
+from flowrec.run import RunControl, Signals, Watchdog
+from flowrec.stages import load_config
+from flowrec.store import SessionReader
+from flowrec.verbs import Change, replay_session
 from flowrec.verbs import record as verb
-from flowrec.verbs.replay_change import Change
-from flowrec.verbs.session_replay import replay_session
 from tests.conftest import run, until
 from tests.perf.stop_trial import LoggedRig
 from tests.perf.stops import KINDS, Ended, Kind, stop

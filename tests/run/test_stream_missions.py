@@ -9,17 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import SessionError, UsageError
-from flowrec.exports import export
-from flowrec.exports.layout import write_layouts
+from flowrec.core import SessionError, UsageError
+from flowrec.exports import export, write_layouts
 from flowrec.rigs.simulated.world import true_pump
-from flowrec.stages.config import config_from_toml, load_config, to_toml
-from flowrec.store.session import Session
+from flowrec.stages import config_from_toml, load_config, to_toml
+from flowrec.store import Session
+from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
 from flowrec.verbs.compare import compare
 from flowrec.verbs.record import record
 from flowrec.verbs.replay_segments import verify
-from flowrec.verbs.session_replay import replay_session
 from tests.short_missions import SMALL
 from tests.view.test_rrd import File
 

@@ -11,19 +11,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from flowrec.core.enums import Action
-from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import HEARD, SAMPLES, SILENT, STREAMS, Applied
-from flowrec.core.topics import Tick
-from flowrec.core.units import NS_PER_S
-from flowrec.rigs.streams.log import RunLog
-from flowrec.rigs.streams.stream import Chunk, NoStreamError, StreamHead, named_channels
-from flowrec.run.control import RunControl
-from flowrec.run.stream_inputs import StreamInputs
+from flowrec.core import HEARD, NS_PER_S, SAMPLES, SILENT, STREAMS, Action, Applied, RigError, Tick, UsageError
+from flowrec.rigs import Chunk, NoStreamError, RunLog, StreamHead
+from flowrec.rigs.streams.stream import named_channels
+from flowrec.run import RunControl, StreamInputs
 from flowrec.run.stream_reader import StreamReader
+from flowrec.stages import Inputs, StreamSettings
 from flowrec.stages.control.events import event_of
-from flowrec.stages.inputs import Inputs
-from flowrec.stages.stream_settings import StreamSettings
 
 PERIOD_NS = 10_000_000  # of 100 Hz
 EPOCH_NS = 7 * NS_PER_S

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.store.reader import SessionReader
+from flowrec.store import SessionReader
 from tests.conftest import until
 from tests.short_missions import LONG
 

@@ -13,12 +13,10 @@ from typing import cast
 import numpy as np
 import pytest
 
-from flowrec.core.enums import Action
-from flowrec.core.errors import RigError
-from flowrec.core.messages import Currents
-from flowrec.run.control import RAMP_PATIENCE_S, Interrupted, RunControl
-from flowrec.run.signals import Signals
-from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
+from flowrec.core import Action, Currents, RigError
+from flowrec.run import RunControl, Signals, Watchdog
+from flowrec.run.control import RAMP_PATIENCE_S, Interrupted
+from flowrec.run.watchdog import ZERO_PATIENCE_S
 from tests.conftest import until
 
 

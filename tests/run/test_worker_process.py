@@ -16,14 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.errors import FlowrecError
-from flowrec.core.messages import PUMP, FlowField, Mission, PumpShare
-from flowrec.core.topics import Extra, Tick
-from flowrec.run.worker_process import ProcessWorker
-from flowrec.run.workers import work
-from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import Pipeline
-from flowrec.verbs.preparation import prepare
+from flowrec.core import PUMP, Extra, FlowField, FlowrecError, Mission, PumpShare, Tick
+from flowrec.run import ProcessWorker, work
+from flowrec.stages import Pipeline, load_config
+from flowrec.verbs import prepare
 from tests.conftest import HANG_S, until
 from tests.short_missions import SMALL
 

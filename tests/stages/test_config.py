@@ -17,15 +17,14 @@ import pytest
 import tomli_w
 
 import flowrec
-from flowrec.core.errors import FlowrecError, SessionError, UnreachableError, UsageError
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.run.disk_monitor import refuse_below
-from flowrec.stages.config import _BEFORE, _MOVED, Config, config_from_toml, load_config, to_toml, with_sets
+from flowrec.core import FlowrecError, SessionError, UnreachableError, UsageError
+from flowrec.physics import ChipSettings, load_chip
+from flowrec.run import refuse_below
+from flowrec.stages import RIGS, Config, config_from_toml, load_config, to_toml, with_sets
+from flowrec.stages.config import _BEFORE, _MOVED
 from flowrec.stages.resolve import resolve
-from flowrec.stages.rig_settings import RIGS
-from flowrec.store.reader import SessionReader
-from flowrec.verbs.preparation import prepare
+from flowrec.store import SessionReader
+from flowrec.verbs import prepare
 from flowrec.verbs.run_summary import Recorded
 from tests.conftest import run
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.stages.config import config_from_toml, load_config
+from flowrec.core import UsageError
+from flowrec.stages import config_from_toml, load_config
 
 
 @pytest.mark.parametrize(

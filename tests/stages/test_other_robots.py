@@ -15,6 +15,7 @@ from flowrec.core import (
     Applied,
     Demand,
     Estimate,
+    Extra,
     Observations,
     PumpShare,
     RobotWalls,
@@ -24,17 +25,25 @@ from flowrec.core import (
     Track,
     Truth,
 )
-from flowrec.core.topics import Extra
 from flowrec.physics import Robot, clearance_um, load_chip
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, messages_read, run
 from flowrec.run.route_orders import observations_of
-from flowrec.stages import assemble, config_from_toml, load_config, resolve, robot_topic, to_toml
+from flowrec.stages import (
+    Observer,
+    assemble,
+    config_from_toml,
+    load_config,
+    resolve,
+    robot_number,
+    robot_topic,
+    step,
+    to_toml,
+)
 from flowrec.stages.control.events import event_of
-from flowrec.stages.estimation import Observer, Sampler
+from flowrec.stages.estimation import Sampler
 from flowrec.stages.other_robots import OtherRobots, as_stated, expected_robots, observe_others
-from flowrec.stages.pipeline import step
-from flowrec.stages.robot_topics import messages_of, robot_number, robot_topics
+from flowrec.stages.robot_topics import messages_of, robot_topics
 from tests.short_missions import SMALL
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=28.0)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.enums import Outcome, Phase
+from flowrec.core import Outcome, Phase
 from flowrec.physics import sample
-from flowrec.stages.inputs import Inputs
-from flowrec.stages.pipeline import assemble, step
+from flowrec.stages import Inputs, assemble, step
 
 
 @pytest.fixture(scope="module")

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import load_config
+from flowrec.core import UsageError
+from flowrec.physics import load_chip
+from flowrec.stages import commented_toml, load_config
 from flowrec.stages.resolve import resolve
-from flowrec.stages.setting_rows import commented_toml, setting_rows
+from flowrec.stages.setting_rows import SettingRow, setting_rows
 from flowrec.verbs.settings import settings
 
-ROWS = {row.key: row for row in setting_rows()}
+
+@cache
+def rows() -> dict[str, SettingRow]:
+    return {row.key: row for row in setting_rows()}
 
 
 def test_every_setting_states_what_it_means_and_what_is_valid() -> None:
-    assert len(ROWS) > 390
-    assert [key for key, row in ROWS.items() if not row.meaning] == []
-    assert [key for key, row in ROWS.items() if not row.facts] == []
+    assert len(rows()) > 390
+    assert [key for key, row in rows().items() if not row.meaning] == []
+    assert [key for key, row in rows().items() if not row.facts] == []
 
 
 def test_every_section_states_what_it_is_about() -> None:
@@ -31,24 +35,24 @@ def test_every_section_states_what_it_is_about() -> None:
 
 
 def test_the_meaning_of_a_setting_is_the_comment_at_its_own_declaration() -> None:
-    assert ROWS["plan.speed_share"].meaning == "ratio to the robot's speed limit; the rest is left to the controller"
-    assert ROWS["plan.idle_speed_um_s"].meaning.startswith("swimming at this speed takes as much power")
-    assert (ROWS["robot.delay_s"].unit, ROWS["robot.delay_s"].valid) == ("s", "number from 0 to 10")
-    assert ROWS["coils.amplifier.resistance_ohm"].unit == "ohm" and ROWS["recording.disk_floor_gb"].unit == "GB"
-    assert ROWS["plan.policy_share"].read_by == ("time_field",) and ROWS["plan.speed_share"].read_by == ()
+    assert rows()["plan.speed_share"].meaning == "ratio to the robot's speed limit; the rest is left to the controller"
+    assert rows()["plan.idle_speed_um_s"].meaning.startswith("swimming at this speed takes as much power")
+    assert (rows()["robot.delay_s"].unit, rows()["robot.delay_s"].valid) == ("s", "number from 0 to 10")
+    assert rows()["coils.amplifier.resistance_ohm"].unit == "ohm" and rows()["recording.disk_floor_gb"].unit == "GB"
+    assert rows()["plan.policy_share"].read_by == ("time_field",) and rows()["plan.speed_share"].read_by == ()
 
 
 def test_a_meaning_stands_alone_without_the_name_of_the_setting_or_its_neighbour() -> None:
     words = "of|or|and|in|at|by|for|from|to|that|which|kept|likewise|the same|not set"
     leans_on_another = re.compile(rf"({words})\b", re.IGNORECASE)
-    assert [row.key for row in ROWS.values() if leans_on_another.match(row.meaning)] == []
+    assert [row.key for row in rows().values() if leans_on_another.match(row.meaning)] == []
 
 
 def test_a_value_that_is_not_there_has_one_name_for_people() -> None:
-    assert ROWS["plan.idle_speed_um_s"].meaning.endswith("as everything else; not set: half of V")
-    assert ROWS["recording.split_s"].meaning.endswith("another file. Not set: one file")
-    assert ROWS["plan.idle_speed_um_s"].lines()[0] == "plan.idle_speed_um_s = (not set)"
-    told = "\n".join([*(line for row in ROWS.values() for line in row.lines()), *settings().values()])
+    assert rows()["plan.idle_speed_um_s"].meaning.endswith("as everything else; not set: half of V")
+    assert rows()["recording.split_s"].meaning.endswith("another file. Not set: one file")
+    assert rows()["plan.idle_speed_um_s"].lines()[0] == "plan.idle_speed_um_s = (not set)"
+    told = "\n".join([*(line for row in rows().values() for line in row.lines()), *settings().values()])
     assert "None" not in told
 
 

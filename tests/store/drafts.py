@@ -16,16 +16,16 @@ import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 
-from flowrec.core.declarations import Message, array_fields, message_fields
-from flowrec.core.topics import TOPICS
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import ResolvedConfig, load_config
+from flowrec.core import TOPICS, Message, message_fields
+from flowrec.core.declarations import array_fields
+from flowrec.physics import load_chip
+from flowrec.stages import ResolvedConfig, load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations, message_codec
+from flowrec.store import SLOTS, session_header
+from flowrec.store.channels import FRAMES, STATE, declarations, message_codec
 from flowrec.store.codec import encode_record
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.session_metadata import header_records
-from flowrec.store.session_writer import session_header
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)

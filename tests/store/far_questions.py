@@ -12,11 +12,8 @@ from typing import Any
 import numpy as np
 
 import flowrec
-from flowrec.core.enums import Outcome
-from flowrec.store import remote_file
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.traffic import TRAFFIC
-from flowrec.store.writer import SessionWriter
+from flowrec.core import Outcome
+from flowrec.store import TRAFFIC, SessionWriter, WriterOptions, remote_file
 from tests.perf.store_writers import pictures, ticks_of
 
 _HEAD = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core.diagnostics import Timing
-from flowrec.core.messages import (
+from flowrec.core import (
     Applied,
     Currents,
     Demand,
@@ -18,13 +17,13 @@ from flowrec.core.messages import (
     Observations,
     OperatorEvent,
     Route,
+    Tick,
+    Timing,
     Track,
     Truth,
 )
-from flowrec.core.topics import Tick
-from flowrec.store import codec
+from flowrec.store import SessionHeader, codec
 from flowrec.store.channels import message_codec
-from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.write_queue import Entry
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from flowrec.store import remote_file, traffic
 from tests.extras import why
 
 KEYS = {"AWS_ACCESS_KEY_ID": "KEY-OF-THE-LAB", "AWS_SECRET_ACCESS_KEY": "SECRET-OF-THE-LAB", "AWS_REGION": "us-east-1"}
@@ -80,6 +81,8 @@ def s3_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
     from moto.moto_api._internal import moto_api_backend
 
     server = S3Server()
+    monkeypatch.setattr(traffic, "_PAUSE_S", 0.01)
+    remote_file._remembered.clear()
     for name, value in {**KEYS, "AWS_ENDPOINT_URL": server.url}.items():
         monkeypatch.setenv(name, value)
     try:

@@ -11,11 +11,8 @@ import pytest
 
 import flowrec
 from flowrec.archive.sweep.tasks import content_of, session_files
-from flowrec.core.errors import FlowrecError, SessionError, UsageError
-from flowrec.store import remote_file, traffic
-from flowrec.store.reader import SessionReader
-from flowrec.store.run_files import part_path
-from flowrec.store.session import Session
+from flowrec.core import FlowrecError, SessionError, UsageError
+from flowrec.store import Session, SessionReader, part_path, remote_file
 from flowrec.store.session_path import session_path
 from flowrec.verbs.ls import ls
 from tests.conftest import invoke
@@ -41,8 +38,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def bucket(run: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
     """Holds the run, a session beside it, and a folder."""
-    monkeypatch.setattr(traffic, "_PAUSE_S", 0.01)
-    remote_file._remembered.clear()
     with s3_server(monkeypatch) as server:
         client = server.client
         for file in run.parent.iterdir():

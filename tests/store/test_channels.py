@@ -2,11 +2,9 @@
 
 import pytest
 
-from flowrec.core.errors import UsageError
+from flowrec.core import UsageError
+from flowrec.store import SessionReader, SessionWriter, WriterOptions
 from flowrec.store.channels import VIEWED, left_out
-from flowrec.store.reader import SessionReader
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(60))

@@ -8,19 +8,16 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from flowrec.core.errors import SessionError
-from flowrec.store.channels import SLOTS
+from flowrec.core import SessionError
+from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, records_in
 from flowrec.store.mcap_reader import McapReader
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
-from flowrec.store.session_file import SessionFile, Snapshot, Split, WriterOptions
+from flowrec.store.session_file import SessionFile, Snapshot, Split
 from flowrec.store.session_metadata import DIGEST, OUTCOME
 from flowrec.store.viewer_scene import ViewerScene
 from flowrec.store.viewer_topics import ViewerTopics
-from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_recovery import DRAWN, chunks_of, cut, flush_every

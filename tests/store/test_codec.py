@@ -9,10 +9,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from flowrec.core.declarations import Matrix, Message, Vector, array_fields, as_read, defaulted_fields, message_fields
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Event, FlowField, Frame, OperatorEvent, Track
-from flowrec.core.topics import TOPICS
+from flowrec.core import (
+    TOPICS,
+    Event,
+    FlowField,
+    Frame,
+    Matrix,
+    Message,
+    OperatorEvent,
+    SessionError,
+    Track,
+    as_read,
+    defaulted_fields,
+    message_fields,
+)
+from flowrec.core.declarations import Vector, array_fields
 from flowrec.store import codec
 from flowrec.store.channels import message_codec
 from tests.store.made_up import decode, encode

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
-from flowrec.core.system.outputs import OutputError
-from flowrec.stages.config import load_config
-from flowrec.store.session import Session
+from flowrec.core import OutputError, UsageError
+from flowrec.stages import load_config
+from flowrec.store import Session
+from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
 from flowrec.verbs.cut import cut
 from flowrec.verbs.record import record
-from flowrec.verbs.session_replay import replay_session
 from tests.short_missions import SMALL
 
 

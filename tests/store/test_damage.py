@@ -23,13 +23,9 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Currents
-from flowrec.store import channels, file_reader, session_metadata
+from flowrec.core import Currents, SessionError
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, file_reader, session_metadata
 from flowrec.store.mcap_writer import McapWriter
-from flowrec.store.reader import SessionReader
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
 

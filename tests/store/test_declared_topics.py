@@ -15,19 +15,36 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowrec.core.declarations import Message, Shape, Source, Topic, Vector, message_fields
-from flowrec.core.declared_topics import TopicTable, declaration, declared_topic, message_of
-from flowrec.core.errors import SessionError, UsageError
-from flowrec.core.messages import Frame, Track
-from flowrec.core.topics import Extra, Tick
-from flowrec.store import channels
+from flowrec.core import (
+    Extra,
+    Frame,
+    Message,
+    SessionError,
+    Source,
+    Tick,
+    Topic,
+    TopicTable,
+    Track,
+    UsageError,
+    declaration,
+    declared_topic,
+    message_fields,
+    message_of,
+)
+from flowrec.core.declarations import Shape, Vector
+from flowrec.store import (
+    Session,
+    SessionReader,
+    SessionWriter,
+    WriterOptions,
+    channels,
+    part_path,
+    recover,
+    recover_run,
+)
 from flowrec.store.channels import left_out
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover, recover_run
-from flowrec.store.run_files import part_path, snapshot_path
-from flowrec.store.session import Session
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.store.run_files import snapshot_path
+from flowrec.store.session_file import Snapshot, Split
 from tests.store.drafts import made_up
 from tests.store.made_up import HEADER, ticks_of
 

@@ -15,22 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Frame
-from flowrec.core.topics import Tick
-from flowrec.core.units import NS_PER_S, seconds
-from flowrec.stages.config import load_config
-from flowrec.store.channels import SLOTS
+from flowrec.core import NS_PER_S, Frame, SessionError, Tick, seconds
+from flowrec.stages import load_config
+from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.parts import Parts
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
 from flowrec.store.segments import RecordingPlan
-from flowrec.store.session_file import WriterOptions
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
-from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, PERIOD_NS, entry_of, ticks_of
 

@@ -12,13 +12,13 @@ import zstandard
 from mcap.reader import NonSeekingReader, make_reader
 
 import flowrec
-from flowrec.core.errors import UsageError
+from flowrec.core import UsageError
+from flowrec.store import is_copy, recover
 from flowrec.store.channels import SessionContents
-from flowrec.store.gathered_copies import GatheredCopies, is_copy
+from flowrec.store.gathered_copies import GatheredCopies
 from flowrec.store.lookup_record import LOOKUP_OPCODE
 from flowrec.store.mcap_format import CRC, RECORD_HEAD
 from flowrec.store.mcap_reader import McapReader
-from flowrec.store.recovery import recover
 from tests.extras import needs
 from tests.perf.large import LOADS, write_sparse
 from tests.store.far_questions import MOST_REQUESTS, MOST_TRIPS, QUESTIONS, Trips, ask, write_session

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from flowrec.core.messages.streams import PUMP, SAMPLES, STREAMS
-from flowrec.core.topics import TOPICS
+from flowrec.core import PUMP, SAMPLES, STREAMS, TOPICS
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 
 NOTEBOOK = Path(__file__).parents[2] / "notebooks" / "07_format.ipynb"

@@ -19,17 +19,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 
-from flowrec.core.errors import RigError, SessionError, UsageError
-from flowrec.core.messages import PIXEL_BITS, Frame, pixel_type
-from flowrec.stages.config import Recording, load_config
-from flowrec.store import codec
+from flowrec.core import PIXEL_BITS, Frame, RigError, SessionError, UsageError, pixel_type
+from flowrec.stages import load_config
+from flowrec.stages.config import Recording
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, codec, frames_of, recover
 from flowrec.store.frame_encodings import ENCODINGS, decode_image, encoding_for, row_differences
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
 from flowrec.store.schema import foxglove_schema
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_writer import frames_of
-from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
 

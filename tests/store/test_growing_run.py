@@ -9,12 +9,9 @@ from dataclasses import replace
 
 import pytest
 
-from flowrec.core.errors import SessionError
-from flowrec.store.growing_run import GrowingRun, live_runs
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.session_file import Split, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import SessionError
+from flowrec.store import GrowingRun, SessionReader, SessionWriter, WriterOptions, live_runs, recover
+from flowrec.store.session_file import Split
 from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, ticks_of
 

@@ -11,17 +11,26 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from flowrec.core.declarations import Message, as_read, invalid_numbers, message_fields, shape_error
-from flowrec.core.errors import SessionError, UsageError, printable
-from flowrec.core.messages import Estimate, FlowField, Frame
-from flowrec.core.topics import BY_FIELD, TOPICS, Tick
+from flowrec.core import (
+    BY_FIELD,
+    TOPICS,
+    Estimate,
+    FlowField,
+    Frame,
+    Message,
+    SessionError,
+    Tick,
+    UsageError,
+    as_read,
+    invalid_numbers,
+    message_fields,
+    printable,
+    shape_error,
+)
 from flowrec.exports.export import export
-from flowrec.physics.chip.io import chip_from_files
-from flowrec.stages.config import config_from_toml
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.physics import chip_from_files
+from flowrec.stages import config_from_toml
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
 from tests.conftest import invoke
 from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, text

@@ -13,9 +13,8 @@ import pytest
 import zstandard
 from mcap.records import Schema
 
-from flowrec.core.errors import SessionError
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
+from flowrec.core import SessionError
+from flowrec.store import SessionReader, recover
 from flowrec.verbs.check import check
 from tests.conftest import invoke
 from tests.store.drafts import CHANNEL, CHUNK_INDEX, MESSAGE, METADATA, SCHEMA, TICKS, record, text

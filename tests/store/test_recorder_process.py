@@ -14,15 +14,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.units import NS_PER_S
-from flowrec.store import recorder_process, shared_queue
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.run_files import files_of
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import NS_PER_S, OperatorEvent, SessionError
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, files_of, recorder_process, recover, shared_queue
+from flowrec.store.session_file import Snapshot, Split
 from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 from tests.store.test_chunk_copies import messages_of

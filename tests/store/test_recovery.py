@@ -10,21 +10,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowrec.core.declarations import Role
-from flowrec.core.errors import SessionError
-from flowrec.core.system.locks import is_growing
-from flowrec.core.topics import TOPICS
-from flowrec.run.recorded import RecordedRig
-from flowrec.store.channels import SLOTS, VIEW
+from flowrec.core import TOPICS, Role, SessionError, is_growing
+from flowrec.run import RecordedRig
+from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
+from flowrec.store.channels import VIEW
 from flowrec.store.mcap_reader import McapReader
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
-from flowrec.store.session_file import SessionFile, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.store.session_file import SessionFile
+from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.compare import compare
-from flowrec.verbs.replay_change import Change
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_damage import KILLED, names_in
 

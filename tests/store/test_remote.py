@@ -17,13 +17,12 @@ from pathlib import Path
 import pytest
 
 import flowrec
-from flowrec.core.errors import FlowrecError, SessionError, UsageError
-from flowrec.exports.layout import write_layouts
-from flowrec.store import remote_file, traffic
+from flowrec.core import FlowrecError, SessionError, UsageError
+from flowrec.exports import write_layouts
+from flowrec.store import TIMEOUT_KEY, TRAFFIC, RefusedError, UrlPath, remote_file, session_sha256, traffic
 from flowrec.store.object_requests import _redirect_target
-from flowrec.store.run_files import session_sha256
-from flowrec.store.session_path import UrlPath, session_path
-from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError, ask_repeatedly
+from flowrec.store.session_path import session_path
+from flowrec.store.traffic import ask_repeatedly
 from tests.conftest import HANG_S, invoke, run
 from tests.extras import needs
 from tests.store.range_server import Fault, RangeServer, answer, served, some, status

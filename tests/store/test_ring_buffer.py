@@ -12,17 +12,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Event, Frame, OperatorEvent
-from flowrec.core.units import NS_PER_S
-from flowrec.store.channels import FRAME_PATH
+from flowrec.core import NS_PER_S, Event, Frame, OperatorEvent, SessionError
+from flowrec.store import FRAME_PATH, SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.mcap_writer import McapWriter
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
 from flowrec.store.run_files import snapshot_path
-from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.store.session_file import SessionFile, Snapshot
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import slow_disk

@@ -5,19 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.stages.config import load_config
+from flowrec.core import UsageError
+from flowrec.stages import load_config
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, nonzero_window, recover
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.roi import Region, WindowSelector, nonzero_window
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.store.roi import Region, WindowSelector
+from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.check import check
 from flowrec.verbs.info import info
 from flowrec.verbs.record import record
-from flowrec.verbs.replay_change import Change
 from tests.short_missions import SMALL
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 

@@ -9,26 +9,30 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowrec.core.errors import SessionError
-from flowrec.core.topics import BY_FIELD, Tick
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import load_config
+from flowrec.core import BY_FIELD, SessionError, Tick
+from flowrec.physics import load_chip
+from flowrec.stages import load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover_run
-from flowrec.store.run_files import part_path, partial_path, parts, run_files, run_path, session_sha256, snapshot_path
-from flowrec.store.session import Session
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_metadata import Part
-from flowrec.store.session_writer import session_header
-from flowrec.store.writer import SessionWriter
+from flowrec.store import (
+    Part,
+    Session,
+    SessionReader,
+    SessionWriter,
+    WriterOptions,
+    part_path,
+    recover_run,
+    run_path,
+    session_header,
+    session_sha256,
+)
+from flowrec.store.run_files import partial_path, parts, run_files, snapshot_path
+from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.check import check
 from flowrec.verbs.compare import compare
 from flowrec.verbs.info import info
 from flowrec.verbs.ls import ls
 from flowrec.verbs.record import record
-from flowrec.verbs.replay_change import Change
 from tests.conftest import typed
 from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of

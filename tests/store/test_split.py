@@ -17,20 +17,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from flowrec.core.errors import SessionError
-from flowrec.core.topics import Tick
-from flowrec.core.units import NS_PER_S, seconds
-from flowrec.store.channels import SLOTS
+from flowrec.core import NS_PER_S, SessionError, Tick, seconds
+from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, part_path, recover
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.parts import Parts
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.run_files import part_path, run_files
+from flowrec.store.run_files import run_files
 from flowrec.store.scan import scan
 from flowrec.store.segments import RecordingPlan
-from flowrec.store.session_file import Split, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.store.session_file import Split
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import GatedDisk, slow_disk

@@ -10,17 +10,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from flowrec.core.declarations import as_read
-from flowrec.core.messages import Demand, Estimate, Mission, Observations, Route, Track
-from flowrec.physics.chip.registration import Calibration, on_chip
-from flowrec.physics.flow.sampling import sample
-from flowrec.store.roi import nonzero_window, region_from
+from flowrec.core import Demand, Estimate, Mission, Observations, Route, Track, as_read
+from flowrec.physics import Calibration, on_chip, sample
+from flowrec.store import Session, SessionWriter, WriterOptions, nonzero_window
+from flowrec.store.roi import region_from
 from flowrec.store.schema import foxglove_schema
-from flowrec.store.session import Session
-from flowrec.store.session_file import Split, WriterOptions
+from flowrec.store.session_file import Split
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.store.viewer_topics import VIEWER_TOPICS, ViewerTopics
-from flowrec.store.writer import SessionWriter
 from tests.store.made_up import field_of
 
 _SCHEMAS = {view.path: view.schema for view in VIEWER_TOPICS}

@@ -19,17 +19,11 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 
-from flowrec.core.diagnostics import Clocks
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Frame
-from flowrec.core.system.processes import Priority
-from flowrec.core.topics import Tick
-from flowrec.store.audit import digest_faults
-from flowrec.store.reader import SessionReader
+from flowrec.core import Clocks, Frame, Priority, SessionError, Tick
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, digest_faults
 from flowrec.store.schema import foxglove_schema
-from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.session_file import Snapshot, Split
 from flowrec.store.viewer_topics import VIEWER_TOPICS
-from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 

@@ -15,7 +15,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from flowrec.rigs.emulated.coils import FULL_A, OutputSamples, compiled_firmware, compiler, emulated_board
+from flowrec.rigs import compiled_firmware, emulated_board
+from flowrec.rigs.emulated.coils import FULL_A, OutputSamples, compiler
 
 _ROOT = Path(__file__).parents[2]
 

@@ -9,10 +9,9 @@ from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
-from flowrec.physics.chip.io import load_chip
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import assemble
+from flowrec.physics import load_chip
+from flowrec.rigs import SimulatedRig
+from flowrec.stages import assemble, load_config
 from flowrec.stages.resolve import resolve
 from tests.twins.coils import environment
 from tests.twins.emulator import showing

@@ -29,7 +29,7 @@ import session_pb2
 from nidaqmx._stubs import nidaqmx_pb2 as pb
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
-from flowrec.core.system.processes import Priority, prioritise_process
+from flowrec.core import Priority, prioritise_process
 from flowrec.rigs.emulated.coils import sample
 
 DEVICE, RANGE_V, MAX_RATE_HZ = "cDAQ1Mod1", 10.0, 100_000.0

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 
-from flowrec.core.declarations import Image
-from flowrec.stages.config import ResolvedConfig
+from flowrec.core import Image
+from flowrec.stages import ResolvedConfig
 
 _FILES = 3  # of the folder; the emulator reads one after the other, and keeps a file in memory where there is only one
 _FEATURES = """# {{05D8C294-F295-4dfb-9D01-096BD04049F4}}

@@ -13,17 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import FlowrecError, RigError
-from flowrec.core.topics import Tick
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.control import RunControl
-from flowrec.run.workers import LockstepWorker
-from flowrec.stages.config import load_config
-from flowrec.stages.inputs import Inputs
-from flowrec.verbs import admission
+from flowrec.core import FlowrecError, RigError, Tick
+from flowrec.rigs import SimulatedRig
+from flowrec.run import LockstepWorker, RunControl
+from flowrec.stages import Inputs, load_config
+from flowrec.verbs import admission, prepare
 from flowrec.verbs.admission import Held, admit
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.preparation import Prepared, prepare
+from flowrec.verbs.preparation import Prepared
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
+from flowrec.core import UsageError
 from flowrec.measure.calibrate_motion import calibrate_motion
-from flowrec.stages.config import load_config
+from flowrec.stages import load_config
 from tests.conftest import run
 from tests.movies import makers
 

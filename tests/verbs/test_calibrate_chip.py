@@ -6,15 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from flowrec.core.errors import ChipError, FlowrecError, UsageError
-from flowrec.core.system.outputs import OutputError
+from flowrec.core import ChipError, FlowrecError, OutputError, UsageError
 from flowrec.measure import outline
 from flowrec.measure.calibrate_chip import calibrate_chip
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.flow.sampling import sample
-from flowrec.physics.flow.solver import FlowSolver
+from flowrec.physics import Calibration, ChipSettings, FlowSolver, load_chip, sample
 from tests.conftest import invoke
 from tests.physics.chip.looks import LOOKS, picture
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
-from flowrec.measure.calibrate_image import fragment, registration_state
-from flowrec.physics.chip.registration import Calibration
-from flowrec.stages.config import load_config, with_sets
-from flowrec.stages.rig_settings import CameraSettings
+from flowrec.core import UsageError
+from flowrec.measure import registration_state
+from flowrec.measure.calibrate_image import fragment
+from flowrec.physics import Calibration
+from flowrec.stages import CameraSettings, load_config, with_sets
 from flowrec.verbs.record import record
 from tests.conftest import invoke
 from tests.short_missions import SMALL

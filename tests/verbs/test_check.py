@@ -13,15 +13,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import flowrec
-from flowrec.core.diagnostics import CameraLosses
-from flowrec.core.errors import SessionError
-from flowrec.core.system.endings import Ended
-from flowrec.core.topics import Tick
-from flowrec.store.channels import SLOTS
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import CameraLosses, Ended, SessionError, Tick
+from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
 from tests.conftest import typed
 from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text

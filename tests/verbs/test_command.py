@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 import flowrec
 from flowrec.core import Ended, UsageError
+from flowrec.verbs import Asked, MisuseError, Told, verb
 from flowrec.verbs.cli import app
-from flowrec.verbs.command import MethodsOf, MisuseError, Told, add_verb, verb
-from flowrec.verbs.options import Asked, Supplied
+from flowrec.verbs.command import MethodsOf, add_verb
+from flowrec.verbs.options import Supplied
 
 TABLE = "flowrec.stages.planning.planner:PLANNERS"
 

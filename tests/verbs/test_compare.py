@@ -10,14 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.declarations import as_read
-from flowrec.core.messages import Demand, FlowField
-from flowrec.core.system.endings import Ended
-from flowrec.core.topics import Tick, topics_of
-from flowrec.stages.config import load_config, to_toml
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_metadata import SessionHeader
-from flowrec.store.writer import SessionWriter
+from flowrec.core import Demand, Ended, FlowField, Tick, as_read
+from flowrec.core.topics import topics_of
+from flowrec.stages import load_config, to_toml
+from flowrec.store import SessionHeader, SessionWriter, WriterOptions
 from flowrec.verbs.compare import compare
 from flowrec.verbs.comparison import Comparison
 from tests.conftest import answered

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.stages.planning.planner import PLANNERS
+from flowrec.stages import PLANNERS
 from flowrec.stages.setting_rows import setting_rows
 from flowrec.verbs import completion
 from flowrec.verbs.completion import complete_section, complete_setting

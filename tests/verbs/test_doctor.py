@@ -12,13 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flowrec.core.diagnostics import CameraLosses
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import AS_STATED, ORIENTATIONS, Calibration, Orientation
+from flowrec.core import CameraLosses
+from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, ChipSettings, Orientation, load_chip
+from flowrec.rigs import CameraInfo
 from flowrec.rigs.lab.cameras import probe as camera
-from flowrec.rigs.lab.cameras.camera import CameraInfo
-from flowrec.stages.config import Config, load_config, registration_of, with_sets
+from flowrec.stages import Config, load_config, registration_of, with_sets
 from flowrec.stages.resolve import resolve
 from flowrec.verbs import diagnosis
 from flowrec.verbs.diagnosis import FAILURE, OK, WARNING, diagnose
@@ -45,6 +43,12 @@ SEEN = camera.CameraProbe(
     brightest=200,
     notes=(),
 )
+
+
+@pytest.fixture(autouse=True)
+def short_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is tried with 4 MB."""
+    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
 
 
 def levels(config: Config, folder: Path) -> dict[str, str]:
@@ -79,7 +83,6 @@ def test_what_a_camera_shows_is_judged(
     seen: camera.CameraProbe, what: str, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: seen)
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
     config = load_config(None, [*MEASURED, "mission.phases=observe"])
     assert levels(config, tmp_path)[what] == level
 
@@ -94,7 +97,6 @@ def test_a_chip_that_was_turned_since_its_registration_is_noticed(
     image = picture(chip.mask, chip.um_per_px, truth, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
     info = replace(SEEN.info, width_px=320, height_px=256)
     monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
     sets = ["camera.width_px=320", "camera.height_px=256", "mission.phases=observe"]
     assert levels(load_config(None, [*MEASURED, *sets]), tmp_path)["walls"] == level
 
@@ -117,7 +119,6 @@ def test_a_camera_that_shows_the_chip_in_another_orientation_is_a_failure_with_t
     image = picture(chip.mask, chip.um_per_px, true, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
     info = replace(SEEN.info, width_px=320, height_px=256)
     monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
     axes = {one.what: one for one in diagnose(config, folder=tmp_path)}["axes"]
     assert (axes.level == OK) == (orientation == AS_STATED)
     sets = [each.replace(" ", "") for each in axes.text.partition(": set ")[2].split(", ") if each]
@@ -134,16 +135,12 @@ def test_a_disk_is_judged_by_what_the_camera_delivers(
 
 
 @pytest.mark.slow("flies the rehearsal of a mission")
-def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path) -> None:
     told = {one.what: one.text for one in diagnose(load_config(), folder=tmp_path)}
     assert "mission with this configuration's methods went through" in told["kernels"]
 
 
-def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(tmp_path: Path) -> None:
     sets = [*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
     words = ["doctor", "--json", "--folder", str(tmp_path), *(word for text in sets for word in ("--set", text))]
     done = invoke(*words)
@@ -180,10 +177,7 @@ def test_a_registration_is_judged_by_its_age_and_its_residual(
     assert levels(load_config(None, sets), tmp_path)["registration"] == level
 
 
-def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_same(tmp_path: Path) -> None:
     devices = ["lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
     for wrong, text in {
         "robot.radius_um=-5.0": "robot.radius_um = -5",

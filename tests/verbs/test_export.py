@@ -13,11 +13,9 @@ from pathlib import Path
 import pytest
 
 import flowrec
-from flowrec.core.errors import SessionError, UsageError
-from flowrec.core.system.outputs import OutputError
-from flowrec.exports.formats import EXPORTS
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import OutputError, SessionError, UsageError
+from flowrec.exports import EXPORTS
+from flowrec.store import SessionWriter, WriterOptions
 from flowrec.verbs.view import view
 from tests.conftest import invoke
 

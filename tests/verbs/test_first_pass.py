@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
-from flowrec.physics.chip.io import chip_files
-from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.config import Config, load_config, to_toml
-from flowrec.stages.control.field_log import FieldLog
+from flowrec.core import UsageError
+from flowrec.physics import FlowSolver, chip_files
+from flowrec.stages import Config, FieldLog, load_config, to_toml
 from flowrec.verbs.first_pass import MovieTracks, radius_in_image
 from flowrec.verbs.misfit import trembling as trembling_um
 from flowrec.verbs.misfit import why_unexplained

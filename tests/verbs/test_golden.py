@@ -16,12 +16,11 @@ import pytest
 from numpy.typing import NDArray
 
 import flowrec
-from flowrec.core.units import UM_PER_M
-from flowrec.core.version import NUMERICS_VERSION
-from flowrec.physics.flow.newton_solver import Scales, System, system
-from flowrec.store.reader import SessionReader
+from flowrec.core import NUMERICS_VERSION, UM_PER_M
+from flowrec.physics import Scales, System, system
+from flowrec.store import SessionReader
+from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
-from flowrec.verbs.replay_change import Change
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 MODERATE = GOLDEN.with_name("golden_moderate.mcap")

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import FlowrecError, MovieError, UsageError
-from flowrec.physics.chip.io import chip_files
-from flowrec.physics.flow.sampling import relative_rmse
-from flowrec.stages.config import Config, load_config
+from flowrec.core import FlowrecError, MovieError, UsageError
+from flowrec.physics import chip_files, relative_rmse
+from flowrec.stages import Config, load_config
 from tests.conftest import run
 from tests.movies import makers
 
@@ -390,8 +389,8 @@ def test_gaps_in_the_cameras_numbers_are_counted_as_losses(lab: Laboratory, tmp_
 def test_a_rig_that_plays_a_movie_is_paced_by_its_stamps(lab: Laboratory, tmp_path: Path) -> None:
     """The sleeps between images add up to the stamps; no clock is asserted."""
     from flowrec.rigs.movie import rig as module
-    from flowrec.stages.rig_settings import RIGS
-    from flowrec.verbs.preparation import prepare
+    from flowrec.stages import RIGS
+    from flowrec.verbs import prepare
 
     asked = flowrec.stages.config.with_sets(
         lab.config, ["rig=movie", f"movie.path={lab.folder / 'film.avi'}", f"movie.coils={lab.log}"]

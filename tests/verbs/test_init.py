@@ -11,15 +11,12 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import ChipError, RigError, UsageError
-from flowrec.core.system.outputs import OutputError
-from flowrec.movies.opening import open_movie
-from flowrec.physics.chip.io import load_chip
-from flowrec.rigs.lab.cameras.probe import first_camera
-from flowrec.stages.config import Config, load_config, with_sets
-from flowrec.stages.control.coil_log import columns_by_unit
+from flowrec.core import ChipError, OutputError, RigError, UsageError
+from flowrec.movies import open_movie
+from flowrec.physics import load_chip
+from flowrec.rigs import first_camera
+from flowrec.stages import CameraSettings, Config, Lab, columns_by_unit, load_config, with_sets
 from flowrec.stages.resolve import resolve
-from flowrec.stages.rig_settings import CameraSettings, Lab
 from flowrec.verbs.doctor import doctor
 from flowrec.verbs.init import LAB as LAB_WORD
 from flowrec.verbs.init import StartedConfig, _try_amplifier, init

@@ -9,10 +9,9 @@ import pytest
 from mcap.reader import make_reader
 from rerun.chunk import RrdReader
 
-from flowrec.core.system.outputs import OutputError
-from flowrec.exports.layout import write_layouts
-from flowrec.store.channels import SLOTS
-from flowrec.store.session import Session
+from flowrec.core import OutputError
+from flowrec.exports import write_layouts
+from flowrec.store import SLOTS, Session
 from flowrec.view.bare_plots import EVENTS, IMAGE, MAPS, ON_IMAGE, PLOTS, ROUTE, STATES
 from tests.rewritten import parser_of
 

@@ -12,14 +12,10 @@ from pathlib import Path
 import pytest
 from websockets.sync.client import connect
 
-from flowrec.core.errors import SessionError, UsageError
-from flowrec.run.control import RunControl
-from flowrec.run.remote_control import CommandSocket
-from flowrec.store.notes import notes_file
-from flowrec.store.reader import SessionReader
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
-from flowrec.verbs.listing import read_each
+from flowrec.core import SessionError, UsageError
+from flowrec.run import CommandSocket, RunControl
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, notes_file
+from flowrec.verbs import read_each
 from flowrec.verbs.ls import ls
 from flowrec.verbs.view import view as view_session
 from tests.conftest import HANG_S, typed

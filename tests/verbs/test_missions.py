@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.system.outputs import MCAP, Output
-from flowrec.run.replay_figures import before_after
-from flowrec.stages.config import load_config
-from flowrec.store.reader import SessionReader
+from flowrec.core import MCAP, Output
+from flowrec.run import before_after
+from flowrec.stages import load_config
+from flowrec.store import SessionReader
+from flowrec.verbs import refly
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.record import record
-from flowrec.verbs.replay_made import refly
 from flowrec.verbs.run_summary import GOOD_ENDS, Recorded
 from tests.conftest import made_once
 from tests.short_missions import SMALL

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import flowrec
+from flowrec.core import NUMERICS_VERSION
 from flowrec.core.provenance import provenance
-from flowrec.core.version import NUMERICS_VERSION
-from flowrec.stages.estimation.kalman import Kalman
+from flowrec.stages import Kalman
 from tests.conftest import run
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
@@ -99,7 +99,7 @@ def test_a_difference_by_the_same_numerics_is_one(
 
 
 def test_a_setting_that_a_session_does_not_have_is_the_old_default() -> None:
-    from flowrec.stages.config import config_from_toml, to_toml
+    from flowrec.stages import config_from_toml, to_toml
 
     config = flowrec.open(GOLDEN).config
     text = to_toml(config)

@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages import Sight, pipeline
-from flowrec.stages.config import load_config
+from flowrec.core import UsageError
+from flowrec.physics import load_chip
+from flowrec.stages import Sight, load_config, pipeline
 from flowrec.stages.resolve import resolve
-from flowrec.store.reader import SessionReader
-from flowrec.store.session import Session
+from flowrec.store import Session, SessionReader
+from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
 from flowrec.verbs.record import record
-from flowrec.verbs.session_replay import replay_session
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.toml"
 OBSERVE = ("mission.phases=observe", "duration_s=3.0", "recording.own_process=false")

@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.errors import FlowrecError, UsageError
-from flowrec.rigs.emulated.camera import EmulatedCamera
+from flowrec.core import FlowrecError, UsageError
+from flowrec.rigs import EmulatedCamera, EmulatedInstruments
 from flowrec.rigs.emulated.coils import OutputSamples, sample
-from flowrec.rigs.emulated.instruments import EmulatedInstruments
-from flowrec.stages.config import load_config
-from flowrec.stages.control.coils import Coils
-from flowrec.store.session import Session
+from flowrec.stages import Coils, load_config
+from flowrec.store import Session
 from flowrec.verbs import protocol, ways_out
 from flowrec.verbs.protocol import FAILED, NOT_DONE, PASSED, RESULTS, DayProtocol, walk
 from flowrec.verbs.protocol_hands import Answers, EmulatedHand, Person

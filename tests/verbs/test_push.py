@@ -19,15 +19,18 @@ import pytest
 import flowrec
 from flowrec.archive.push import PushedFile, push
 from flowrec.archive.verbs import push as push_verb
-from flowrec.core.errors import FlowrecError, UsageError
-from flowrec.core.system.endings import Ended, StoppedError
-from flowrec.store import bucket_upload, remote_file, traffic
-from flowrec.store.run_files import part_path, session_sha256
-from flowrec.store.session import Session
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_path import UrlPath
-from flowrec.store.traffic import TRAFFIC
-from flowrec.store.writer import SessionWriter
+from flowrec.core import Ended, FlowrecError, StoppedError, UsageError
+from flowrec.store import (
+    TRAFFIC,
+    Session,
+    SessionWriter,
+    UrlPath,
+    WriterOptions,
+    bucket_upload,
+    part_path,
+    remote_file,
+    session_sha256,
+)
 from tests.conftest import HANG_S, invoke, until
 from tests.store.made_up import ticks_of
 from tests.store.s3_server import BUCKET, KEYS, S3Server, s3_server
@@ -41,9 +44,7 @@ LARGE_PARTS = 4
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
-    monkeypatch.setattr(traffic, "_PAUSE_S", 0.01)
     monkeypatch.setattr(bucket_upload, "_PART_BYTES", PART_BYTES)
-    remote_file._remembered.clear()
     with s3_server(monkeypatch) as found:
         yield found
 

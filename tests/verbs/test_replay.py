@@ -9,23 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flowrec.core.enums import WorkOrder
-from flowrec.core.errors import SessionError, UsageError
-from flowrec.core.messages import Estimate
-from flowrec.core.topics import ANSWERED_BY, WORKER_FIELDS, Tick
-from flowrec.physics.flow.sampling import relative_rmse
-from flowrec.run.workers import work
-from flowrec.stages.config import load_config
-from flowrec.stages.estimation import Observer
-from flowrec.stages.pipeline import Pipeline
-from flowrec.stages.refine import Refiner
-from flowrec.store.reader import SessionReader
-from flowrec.store.session import Session
-from flowrec.verbs import replay_segments
+from flowrec.core import ANSWERED_BY, WORKER_FIELDS, Estimate, SessionError, Tick, UsageError, WorkOrder
+from flowrec.physics import relative_rmse
+from flowrec.run import work
+from flowrec.stages import Observer, Pipeline, Refiner, load_config
+from flowrec.store import Session, SessionReader
+from flowrec.verbs import Change, replay_segments
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.compare import compare
 from flowrec.verbs.record import record
-from flowrec.verbs.replay_change import Change
 from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
-from flowrec.core.topics import TOPICS
+from flowrec.core import TOPICS, UsageError
 from flowrec.verbs.replay_result import BeforeAfter
 from tests.conftest import HANG_S, invoke
 from tests.extras import why

@@ -17,23 +17,15 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.enums import Outcome
-from flowrec.core.errors import FlowrecError, UsageError
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.summary import Row
-from flowrec.core.system.outputs import OutputError
+from flowrec.core import FlowrecError, OperatorEvent, Outcome, OutputError, Row, UsageError
+from flowrec.exports import MEANINGS, PathFigure, RecordingFigure, ReportData, TimelineFigure, style
 from flowrec.exports.report import page as pages
-from flowrec.exports.report import style
-from flowrec.exports.report.curve_figures import RecordingFigure
 from flowrec.exports.report.curves import BUCKETS, CurveBuilder
-from flowrec.exports.report.explanations import MEANINGS, OUTCOMES
-from flowrec.exports.report.path_figure import PathFigure
-from flowrec.exports.report.report_data import ReportData
-from flowrec.exports.report.timeline_figure import TimelineFigure
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.exports.report.explanations import OUTCOMES
+from flowrec.store import SessionWriter, WriterOptions
 from flowrec.verbs import report_page as command
-from flowrec.view.colours import ColourScale, Table
+from flowrec.view import ColourScale
+from flowrec.view.colours import Table
 from tests.conftest import invoke, made_once
 
 SESSIONS = Path(__file__).parents[2] / "sessions"

@@ -12,7 +12,7 @@ import pyarrow.parquet
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
+from flowrec.core import UsageError
 from flowrec.stages import load_config, robot_topic
 from flowrec.stages.robot_topics import track_of
 from flowrec.verbs.align import asked_import, fit_import

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import FlowrecError
-from flowrec.core.system.outputs import OutputError
-from flowrec.store.session_file import Split, WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import FlowrecError, OutputError
+from flowrec.store import SessionWriter, WriterOptions
+from flowrec.store.session_file import Split
 from flowrec.verbs.check import check
 from flowrec.verbs.record import record
 from flowrec.verbs.sign import sign

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import flowrec
+from flowrec.measure import MotionFit
 from flowrec.measure.calibrate_motion import calibrate_motion
-from flowrec.measure.motion_fit import MotionFit
 from flowrec.measure.speed_table import fit_speed_table
-from flowrec.stages.config import load_config
-from flowrec.stages.control.field_log import FieldLog
+from flowrec.stages import FieldLog, load_config
 from tests.short_missions import SMALL
 
 RATE_HZ, LATE_S = 30.0, 0.04

@@ -16,13 +16,11 @@ from typing import Any
 import pytest
 
 import flowrec
-from flowrec.core.coverage import Coverage
-from flowrec.core.terminal import Progress
-from flowrec.run.control import RunControl
-from flowrec.verbs import replay_segments
+from flowrec.core import Coverage, Progress
+from flowrec.run import RunControl
+from flowrec.verbs import columns_for_people, replay_segments
 from flowrec.verbs.check_run import FileCheck
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.listed import columns_for_people
 from flowrec.verbs.ls import ls
 from tests.conftest import HANG_S, run
 

@@ -12,29 +12,30 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from flowrec.core.declarations import Role
-from flowrec.core.diagnostics import CameraLosses, Clocks, Drops
-from flowrec.core.messages import (
+from flowrec.core import (
+    TOPICS,
     Appearance,
     AxesCheck,
     Background,
+    CameraLosses,
+    Clocks,
+    Drops,
     Hand,
     Health,
     Measured,
     Observations,
+    Role,
     Shift,
+    Tick,
     Tracers,
     TracerTruth,
 )
-from flowrec.core.topics import TOPICS, Tick
-from flowrec.physics.chip.io import load_chip
-from flowrec.stages.config import load_config
+from flowrec.physics import load_chip
+from flowrec.stages import load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store.audit import digest_faults
-from flowrec.store.session_file import Split, WriterOptions
-from flowrec.store.session_writer import session_header
+from flowrec.store import SessionWriter, WriterOptions, digest_faults, session_header
+from flowrec.store.session_file import Split
 from flowrec.store.viewer_topics import VIEWER_TOPICS
-from flowrec.store.writer import SessionWriter
 from flowrec.verbs.check import check
 from flowrec.verbs.compare import compare
 from tests.conftest import answered

@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import flowrec
-from flowrec.run.workers import work
-from flowrec.stages.pipeline import assemble
+from flowrec.run import work
+from flowrec.stages import assemble
 from flowrec.verbs.comparison import Comparison, Side
 from flowrec.verbs.replay_result import WorkerCheck, WorkerResults
 

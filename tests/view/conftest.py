@@ -10,13 +10,10 @@ import numpy as np
 import psutil
 import pytest
 
+from flowrec.core import Tick, Timing
 from flowrec.core import messages as m
-from flowrec.core.diagnostics import Timing
-from flowrec.core.topics import Tick
-from flowrec.physics.chip.chip import Chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.robot import Robot
-from flowrec.view.scene import Scene
+from flowrec.physics import Calibration, Chip, Robot
+from flowrec.view import Scene
 
 H, W, UM_PER_PX = 256, 320, 4.0
 CAMERA_UM_PER_PX = 2.0

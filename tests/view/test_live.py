@@ -18,14 +18,12 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from flowrec.core.messages import Frame
-from flowrec.core.topics import Tick
-from flowrec.exports.rrd import scene_of
-from flowrec.store.session import Session
-from flowrec.view import viewer
-from flowrec.view.live import ABSENT_S, LiveView
-from flowrec.view.scene import Scene
-from flowrec.view.summary_text import LiveSummary, document_of_run
+from flowrec.core import Frame, Tick
+from flowrec.exports import scene_of
+from flowrec.store import Session
+from flowrec.view import LiveView, Scene, document_of_run, viewer
+from flowrec.view.live import ABSENT_S
+from flowrec.view.summary_text import LiveSummary
 from tests.conftest import HANG_S, until
 
 LISTENING, CONNECTED = "0A", "01"

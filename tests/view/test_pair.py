@@ -9,8 +9,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 import flowrec
-from flowrec.core.errors import SessionError, UsageError
-from flowrec.store.session import Session
+from flowrec.core import SessionError, UsageError
+from flowrec.store import Session
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 

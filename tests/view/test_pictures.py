@@ -11,22 +11,25 @@ import pytest
 import rerun as rr
 
 from flowrec.console.page_state import SHOWN, PageState
-from flowrec.core.enums import Outcome
-from flowrec.core.messages import Applied, FlowField, Measured, Shift
-from flowrec.core.topics import Tick
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.flow.sampling import sample
-from flowrec.stages.run_figures import figures_of
+from flowrec.core import Applied, FlowField, Measured, Outcome, Shift, Tick
+from flowrec.physics import Calibration, sample
+from flowrec.stages import figures_of
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
-from flowrec.view import colours, flow_values, maps
-from flowrec.view.colours import ColourScale
-from flowrec.view.drawing import WindowCompleter
+from flowrec.view import (
+    Batch,
+    ColourScale,
+    Scene,
+    WindowCompleter,
+    arrow_grid,
+    colours,
+    flow_arrows,
+    flow_values,
+    maps,
+    registration_remark,
+)
 from flowrec.view.entities import TIME_TO_GO
-from flowrec.view.feed import Batch
-from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.logger import TickLogger
-from flowrec.view.scene import Scene
-from flowrec.view.summary_text import LiveSummary, registration_remark
+from flowrec.view.summary_text import LiveSummary
 
 
 class Record:

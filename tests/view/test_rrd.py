@@ -15,17 +15,12 @@ import pytest
 from rerun import RecordingStream
 from rerun.chunk import RrdReader
 
-from flowrec.core.diagnostics import Drops
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Health, OperatorEvent
-from flowrec.core.system.outputs import RRD, Output
-from flowrec.core.topics import Tick
+from flowrec.core import RRD, Drops, Health, OperatorEvent, Output, SessionError, Tick
 from flowrec.exports import rrd
-from flowrec.store.session import Session
+from flowrec.store import Session
+from flowrec.view import Scene, summary_document, write_rrd
 from flowrec.view.logger import TickLogger
-from flowrec.view.rrd_file import open_stream, write_rrd
-from flowrec.view.scene import Scene
-from flowrec.view.summary_text import summary_document
+from flowrec.view.rrd_file import open_stream
 
 NONE, TWO = np.zeros(0), np.zeros(2)
 

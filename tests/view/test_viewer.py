@@ -8,13 +8,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from flowrec.core.errors import FlowrecError
-from flowrec.core.topics import Tick
-from flowrec.view import viewer
-from flowrec.view.rrd_file import write_rrd
-from flowrec.view.scene import Scene
+from flowrec.core import FlowrecError, Tick
+from flowrec.view import Scene, open_viewer, viewer, write_rrd
 from flowrec.view.screenshot import screenshot
-from flowrec.view.viewer import open_viewer
 from tests.conftest import until
 
 

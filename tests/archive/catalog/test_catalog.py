@@ -23,14 +23,10 @@ from flowrec.archive.catalog.find import find, open_catalog
 from flowrec.archive.catalog.format import KEY, NAME
 from flowrec.archive.sweep.results import Results
 from flowrec.archive.sweep.tasks import Task, content_of
-from flowrec.core.errors import FlowrecError, SessionError, UsageError
-from flowrec.core.messages import OperatorEvent
-from flowrec.core.system.locks import open_new
-from flowrec.core.system.outputs import OutputError
-from flowrec.store.session import Session
-from flowrec.store.session_file import Split, WriterOptions
-from flowrec.store.writer import SessionWriter
-from flowrec.verbs.listed import columns_of
+from flowrec.core import FlowrecError, OperatorEvent, OutputError, SessionError, UsageError, open_new
+from flowrec.store import Session, SessionWriter, WriterOptions
+from flowrec.store.session_file import Split
+from flowrec.verbs import columns_of
 from flowrec.verbs.ls import ls
 from tests.conftest import HANG_S, typed
 from tests.extras import needs

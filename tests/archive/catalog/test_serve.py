@@ -15,7 +15,7 @@ import pytest
 import flowrec
 from flowrec.archive.catalog.refresh import refresh
 from flowrec.archive.catalog.serve import FOLDER, recordings_of
-from flowrec.core.errors import UsageError
+from flowrec.core import UsageError
 from tests.conftest import HANG_S
 from tests.extras import why
 

@@ -28,11 +28,9 @@ from flowrec.archive.sweep.ranking import ASSUMED, RECORDED, Ranking
 from flowrec.archive.sweep.replay_process import replay_task
 from flowrec.archive.sweep.results import Results, read_rows
 from flowrec.archive.sweep.tasks import Sessions, Task, change_of, combinations, content_of, session_files
-from flowrec.core.errors import FlowrecError, UsageError
-from flowrec.core.system.outputs import OutputError
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
-from flowrec.verbs.replay_result import refinement_remarks
+from flowrec.core import FlowrecError, OutputError, UsageError
+from flowrec.store import SessionWriter, WriterOptions
+from flowrec.verbs import refinement_remarks
 from tests.archive.sweep.rows import row_of
 from tests.conftest import invoke
 from tests.store.made_up import HEADER, ticks_of

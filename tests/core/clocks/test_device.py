@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from flowrec.core.clocks.device_clock import DeviceClock, envelope
+from flowrec.core import DeviceClock, envelope
 
 
 @settings(max_examples=60)

@@ -13,22 +13,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.clocks.clock_monitor import ClockMonitor, read_clocks
+from flowrec.core import MCAP, ClockMonitor, Output, RigError
+from flowrec.core.clocks.clock_monitor import read_clocks
 from flowrec.core.clocks.device_clock import SLEW
-from flowrec.core.errors import RigError
-from flowrec.core.system.outputs import MCAP, Output
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.loop import run
-from flowrec.run.workers import LockstepWorker
-from flowrec.stages.config import load_config
-from flowrec.stages.inputs import Inputs
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
-from flowrec.store.session import Session
+from flowrec.rigs import SimulatedRig
+from flowrec.run import LockstepWorker, run
+from flowrec.stages import Inputs, load_config
+from flowrec.store import Session, SessionReader, recover
 from flowrec.store.session_writer import session_writer
+from flowrec.verbs import prepare
 from flowrec.verbs.check import check
 from flowrec.verbs.info import facts_for_people, info
-from flowrec.verbs.preparation import prepare
 from tests.conftest import until
 from tests.short_missions import SMALL
 

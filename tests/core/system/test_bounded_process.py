@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import MovieError, UsageError
-from flowrec.core.system.bounded_process import BoundedProcess
-from flowrec.core.system.toml_file import read_toml
+from flowrec.core import BoundedProcess, MovieError, UsageError, read_toml
 from tests.conftest import until
 
 

@@ -13,12 +13,19 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import SessionError
-from flowrec.core.system.durable import append_line, replacing
-from flowrec.core.system.leftovers import OLD, remove_leftovers, temporary_name
-from flowrec.core.system.output_folder import OutputFolder
-from flowrec.core.system.outputs import JSON, Output
-from flowrec.store.notes import append_note, notes_file, read_notes
+from flowrec.core import (
+    JSON,
+    Output,
+    OutputFolder,
+    SessionError,
+    append_line,
+    remove_leftovers,
+    replacing,
+    temporary_name,
+)
+from flowrec.core.system.leftovers import OLD
+from flowrec.store import notes_file
+from flowrec.store.notes import append_note, read_notes
 from tests.conftest import invoke, until
 
 WAITS = """

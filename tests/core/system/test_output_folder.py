@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import SessionError
-from flowrec.core.system.output_folder import MARKER, OutputFolder
-from flowrec.core.system.outputs import OutputError
+from flowrec.core import OutputError, OutputFolder, SessionError
+from flowrec.core.system.output_folder import MARKER
 
 FACTS = {"format": "parquet", "session_key": "1"}
 

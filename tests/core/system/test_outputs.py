@@ -15,12 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import FlowrecError, SessionError
-from flowrec.core.system.locks import is_growing, open_new, remove_idle
-from flowrec.stages.config import load_config
-from flowrec.store.reader import SessionReader
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
+from flowrec.core import FlowrecError, SessionError, is_growing, open_new, remove_idle
+from flowrec.stages import load_config
+from flowrec.store import SessionReader, SessionWriter, WriterOptions
 from flowrec.verbs.record import record
 from tests.conftest import run, until
 from tests.short_missions import LONG, SMALL

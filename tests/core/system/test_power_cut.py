@@ -28,20 +28,12 @@ import pytest
 from flowrec.archive.catalog import catalog_file
 from flowrec.archive.catalog.format import About
 from flowrec.archive.sweep.results import Results, read_rows
-from flowrec.core.system.leftovers import PREFIX, remove_leftovers
-from flowrec.core.system.output_folder import OutputFolder
-from flowrec.core.system.outputs import JSON, Output
-from flowrec.core.units import nanoseconds, seconds
+from flowrec.core import JSON, PREFIX, Output, OutputFolder, nanoseconds, remove_leftovers, seconds
 from flowrec.stages.config import Recording
-from flowrec.store.audit import digest_faults
-from flowrec.store.channels import SLOTS
+from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, digest_faults, recover
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.notes import append_note, read_notes
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
 from tests.archive.sweep.rows import row_of
 from tests.store.made_up import HEADER, ticks_of
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.system.processes import interrupted_too, realtime_priority
+from flowrec.core import interrupted_too, realtime_priority
 from tests.conftest import until
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="a matter of Linux")

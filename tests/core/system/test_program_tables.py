@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from flowrec.core.errors import UsageError
-from flowrec.core.system.table_file import read_table
-from flowrec.stages.config import load_config
-from flowrec.stages.control.coil_log import read_coil_log
-from flowrec.stages.control.coils import Coils
+from flowrec.core import UsageError, read_table
+from flowrec.stages import Coils, load_config, read_coil_log
 from tests.extras import why
 
 TIME, HERTZ, DEGREES, MT = (

@@ -10,16 +10,12 @@ import numpy as np
 import pytest
 
 from flowrec.archive.catalog import catalog_file
-from flowrec.core.errors import FlowrecError
-from flowrec.core.system.table_file import read_table
-from flowrec.core.system.toml_file import read_toml
+from flowrec.core import FlowrecError, read_table, read_toml
 from flowrec.measure.coil_calibration import read_excitations
 from flowrec.movies import open_movie
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.store.notes import append_note, notes_content, notes_file
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import recover
+from flowrec.physics import ChipSettings, load_chip
+from flowrec.store import SessionReader, notes_content, notes_file, recover
+from flowrec.store.notes import append_note
 from tests.movies import makers
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there are no pipes among its files")

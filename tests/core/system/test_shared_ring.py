@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flowrec.core import SharedRing
 from flowrec.core.system.processes import child_environment
-from flowrec.core.system.shared_ring import WORDS, SharedRing
+from flowrec.core.system.shared_ring import WORDS
 from tests.conftest import HANG_S
 
 STEPS = st.lists(st.one_of(st.binary(max_size=300), st.sampled_from(["take", "release"])), max_size=200)

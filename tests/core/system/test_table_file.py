@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 import openpyxl
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.system.table_file import read_table
+from flowrec.core import UsageError, read_table
 
 HEADER, ROWS = ["t", "Heading °"], [[0.5, -90.0], [1.25, 30.0]]
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.physics.chip.registration import Calibration
+from flowrec.physics import Calibration
 
 Picture = NDArray[np.float32]
 _FINER = 4

@@ -8,12 +8,24 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from flowrec.core.errors import ChipError
-from flowrec.physics.chip.chip import Chip, ChipSettings, Opening
-from flowrec.physics.chip.clearance import check_point, clearance_um, median_width_um, nearest_fluid, opening_point_um
-from flowrec.physics.chip.io import chip_files, chip_from_files, load_chip
-from flowrec.physics.chip.openings import distance_um, find_openings, guess_inlets
-from flowrec.physics.flow.solver import FlowSolver
+from flowrec.core import ChipError
+from flowrec.physics import (
+    Chip,
+    ChipSettings,
+    FlowSolver,
+    Opening,
+    check_point,
+    chip_files,
+    chip_from_files,
+    clearance_um,
+    distance_um,
+    find_openings,
+    guess_inlets,
+    load_chip,
+    median_width_um,
+    opening_point_um,
+)
+from flowrec.physics.chip.clearance import nearest_fluid
 
 SESSIONS = Path(__file__).parents[3] / "sessions" / "chips"
 

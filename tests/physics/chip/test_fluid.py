@@ -6,20 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import ChipError
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.fluid import (
-    BLOOD_MPA_S,
-    LAWS,
+from flowrec.core import ChipError
+from flowrec.physics import (
     CarreauYasuda,
+    ChipSettings,
     PowerLaw,
-    TabulatedLaw,
     ViscositySettings,
     blood,
-    law_of,
-    slit_factor,
+    chip_files,
+    chip_from_files,
+    load_chip,
 )
-from flowrec.physics.chip.io import chip_files, chip_from_files, load_chip
+from flowrec.physics.chip.fluid import BLOOD_MPA_S, LAWS, TabulatedLaw, law_of, slit_factor
 
 RATES = np.array([0.0, 0.03, 1.0, 40.0, 900.0])
 SOME = [PowerLaw(0.6, 2.0), CarreauYasuda(0.3, 0.5, 0.05, 1.25), TabulatedLaw((0.1, 1.0, 30.0), (5.0, 3.0, 0.7))]

@@ -7,9 +7,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from flowrec.core.errors import ChipError
+from flowrec.core import ChipError
+from flowrec.physics import chip_from_files, read_vessel_case
 from flowrec.physics.chip.io import KEYS as CASE_KEYS
-from flowrec.physics.chip.io import chip_from_files, read_vessel_case
 
 
 def test_a_mask_that_promises_more_than_it_has_is_refused():

@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from flowrec.measure.picture_registration import orientation_by_image
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import AS_STATED, ORIENTATIONS, Calibration, nearest
+from flowrec.measure import orientation_by_image
+from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, ChipSettings, load_chip, nearest
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.stages.rig_settings import ResolvedCamera
-from flowrec.stages.simulated_settings import SimulatedImage
+from flowrec.stages import ResolvedCamera, SimulatedImage
 
 SIZE_PX = (320, 256)
 MIDDLE_PX = (159.5, 127.5)

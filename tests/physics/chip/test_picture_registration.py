@@ -7,15 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from flowrec.core.errors import ChipError
-from flowrec.measure import wall_fit
-from flowrec.measure.picture_registration import fit_nearby, orientation_by_image, other_scale, overlay, register
+from flowrec.core import ChipError
+from flowrec.measure import orientation_by_image, wall_fit
+from flowrec.measure.picture_registration import fit_nearby, other_scale, overlay, register
 from flowrec.measure.wall_fit import Fitter
 from flowrec.measure.wall_search import Pose, WallMap
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.clearance import median_width_um
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import Calibration
+from flowrec.physics import Calibration, ChipSettings, load_chip, median_width_um
 from tests.physics.chip.looks import LOOKS, picture
 
 VESSELS = load_chip(ChipSettings("vessels", seed=3))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flowrec.physics.chip.registration import Calibration
+from flowrec.physics import Calibration
 
 ANY = st.builds(
     Calibration,

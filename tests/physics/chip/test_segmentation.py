@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
-from flowrec.core.errors import ChipError
+from flowrec.core import ChipError
 from flowrec.measure.segmentation import chip_mask, iou, segment
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.openings import find_openings
-from flowrec.physics.chip.registration import Calibration
+from flowrec.physics import Calibration, ChipSettings, find_openings, load_chip
 from tests.physics.chip.looks import LOOKS, picture
 
 VESSELS = load_chip(ChipSettings("vessels", seed=3))

@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from flowrec.physics.chip.chip import Chip, Opening
-from flowrec.physics.flow.generalised import generalised_equations
-from flowrec.physics.flow.level_set import from_distance
-from flowrec.physics.flow.newton_solver import Scales
+from flowrec.physics import Chip, Opening, Scales, from_distance, generalised_equations
 
 
 @pytest.fixture

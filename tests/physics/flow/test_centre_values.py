@@ -5,14 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.messages import FlowField, Observations
-from flowrec.physics.chip.chip import Chip, Opening
+from flowrec.core import FlowField, Observations
+from flowrec.physics import Chip, FlowSolver, Opening, fluid_image, from_distance, pixel_weights, sample
 from flowrec.physics.flow import newton_solver as systems
-from flowrec.physics.flow.level_set import from_distance
-from flowrec.physics.flow.sampling import fluid_image, sample
-from flowrec.physics.flow.solver import FlowSolver
-from flowrec.physics.flow.velocity_stencil import pixel_weights
-from flowrec.stages.refine import Refiner
+from flowrec.stages import Refiner
 
 SPEED = 100.0
 UM_PER_PX = 10.0

@@ -7,13 +7,10 @@ import pytest
 from scipy.integrate import cumulative_simpson
 from scipy.optimize import brentq
 
-from flowrec.core.errors import FlowError
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.fluid import CarreauYasuda, PowerLaw, TabulatedLaw, blood
-from flowrec.physics.chip.io import load_chip
+from flowrec.core import FlowError
+from flowrec.physics import CarreauYasuda, ChipSettings, FlowSolver, PowerLaw, blood, clear_cache, load_chip
+from flowrec.physics.chip.fluid import TabulatedLaw
 from flowrec.physics.flow import generalised
-from flowrec.physics.flow.linear_solver import clear_cache
-from flowrec.physics.flow.solver import FlowSolver
 
 THIN = PowerLaw(0.5, 1.0, 1e-3)
 

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from flowrec.physics import clear_cache, compute_cached
 from flowrec.physics.flow import linear_solver
-from flowrec.physics.flow.linear_solver import clear_cache, compute_cached, factorise, held_bytes
+from flowrec.physics.flow.linear_solver import factorise, held_bytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flowrec.physics import Robot
 from flowrec.physics.flow import map_error
 from flowrec.physics.flow.map_error import MapError
-from flowrec.physics.robot import Robot
-from flowrec.stages.control import Controller
-from flowrec.stages.estimation import Kalman
+from flowrec.stages import Controller, Kalman, Planner, SurveyPlanner
 from flowrec.stages.estimation.consistency_monitor import StepOut
-from flowrec.stages.planning import Planner, SurveyPlanner
 from tests.stages.planning import worlds
 
 USES = [value for value in vars(map_error).values() if isinstance(value, MapError)]

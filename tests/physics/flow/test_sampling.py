@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.messages import FlowField
-from flowrec.physics.chip.registration import on_chip
-from flowrec.physics.flow.sampling import sample, sample_as_seen
+from flowrec.core import FlowField
+from flowrec.physics import on_chip, sample, sample_as_seen
 
 
 @pytest.fixture

@@ -3,12 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import FlowError
-from flowrec.physics.chip.chip import Chip, Opening
-from flowrec.physics.chip.synthetic import bifurcation
+from flowrec.core import FlowError
+from flowrec.physics import Chip, FlowSolver, Opening, bifurcation, clear_cache
 from flowrec.physics.flow import newton_solver as systems
-from flowrec.physics.flow.linear_solver import clear_cache
-from flowrec.physics.flow.solver import FlowSolver
 
 
 def relative(a, b):

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from flowrec.physics.chip.chip import Chip, Opening
-from flowrec.physics.chip.openings import find_openings, guess_inlets
+from flowrec.physics import Chip, FlowSolver, Opening, find_openings, from_distance, guess_inlets
 from flowrec.physics.flow import newton_solver as systems
 from flowrec.physics.flow.contour_smoothing import contour_segments
 from flowrec.physics.flow.grid import INLET
-from flowrec.physics.flow.level_set import from_distance, from_mask
-from flowrec.physics.flow.solver import FlowSolver
+from flowrec.physics.flow.level_set import from_mask
 
 SPEED = 100.0
 UM_PER_PX = 10.0

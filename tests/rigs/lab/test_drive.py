@@ -17,12 +17,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import FlowrecError, RigError
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.core import FlowrecError, RigError
+from flowrec.rigs import CommandLimits, Guardian
 from flowrec.rigs.lab.drive import Drive
-from flowrec.rigs.lab.guardian import Guardian
-from flowrec.stages.control.field_rotation import FieldCommand
-from flowrec.stages.rig_settings import OutputLimits
+from flowrec.stages import FieldCommand, OutputLimits
 from tests.conftest import needs_quiet, until
 from tests.extras import why
 from tests.perf.guardian import sleeper, trial

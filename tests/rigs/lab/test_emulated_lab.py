@@ -17,26 +17,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.diagnostics import Timing
-from flowrec.core.errors import RigError
-from flowrec.core.messages import Currents
-from flowrec.core.topics import Tick
+from flowrec.core import Currents, RigError, Tick, Timing
 from flowrec.measure.calibrate_motion import calibrate_motion
+from flowrec.rigs import CommandLimits, EmulatedCamera, Wanted, compiled_firmware
 from flowrec.rigs.emulated import coils as emulated_coils
-from flowrec.rigs.emulated.camera import EmulatedCamera
-from flowrec.rigs.emulated.coils import OutputSamples, compiled_firmware, sample
+from flowrec.rigs.emulated.coils import OutputSamples, sample
 from flowrec.rigs.emulated.world import Rolled
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
-from flowrec.rigs.lab.cameras.camera import Wanted
 from flowrec.rigs.lab.cameras.opencv import OpencvCamera
 from flowrec.rigs.lab.drive import Drive
-from flowrec.stages.control.coils import Coils
-from flowrec.stages.control.field_log import FieldLog
-from flowrec.stages.control.field_rotation import FieldCommand
-from flowrec.stages.run_figures import RunStatistics, chain_ms
-from flowrec.store.session import Session
-from flowrec.verbs.session_replay import replay_session
+from flowrec.stages import Coils, FieldCommand, FieldLog, RunStatistics
+from flowrec.stages.run_figures import chain_ms
+from flowrec.store import Session
+from flowrec.verbs import replay_session
 from tests.conftest import needs_quiet, run, until
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, currents
 from tests.twins.coils import needs_compiler

@@ -13,8 +13,7 @@ import pytest
 from flowrec.rigs.emulated.coils import OutputSamples
 from flowrec.rigs.lab.amplifiers.serial_protocol import ZERO, Reply, configuration, field_line, line, reply, telemetry
 from flowrec.rigs.lab.guardian import SERIAL_ZERO
-from flowrec.stages.control.coils import Coils
-from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.stages import Coils, FieldCommand, FieldState, field_motion
 from tests.twins.coils import compiled
 
 COILS = Coils(

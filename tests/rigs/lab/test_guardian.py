@@ -10,16 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import Currents
-from flowrec.physics.robot import Robot
+from flowrec.core import Currents, RigError, UsageError
+from flowrec.physics import Robot
+from flowrec.rigs import CommandLimits, Guardian
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import BEAT_S, Drive
-from flowrec.rigs.lab.guardian import Guardian, watch
-from flowrec.stages.control.coils import Coils
-from flowrec.stages.control.field_rotation import FieldCommand
-from flowrec.stages.rig_settings import OutputLimits
+from flowrec.rigs.lab.guardian import watch
+from flowrec.stages import Coils, FieldCommand, OutputLimits
 
 ON, OFF, TRIP, QUIT, PROBE = b"1", b"0", b"T", b"Q", b"P"
 

@@ -17,15 +17,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.flow.sampling import relative_rmse
-from flowrec.rigs.emulated.world import emulated_world
-from flowrec.stages.config import load_config
-from flowrec.stages.pipeline import assemble
+from flowrec.physics import load_chip, relative_rmse
+from flowrec.rigs import emulated_world
+from flowrec.stages import assemble, load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store.session import Session
+from flowrec.store import Session
+from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
-from flowrec.verbs.session_replay import replay_session
 from tests.conftest import needs_quiet, run
 from tests.extras import why
 from tests.perf.camera_killed import trial

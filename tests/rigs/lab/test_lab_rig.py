@@ -15,17 +15,13 @@ from types import TracebackType
 import numpy as np
 import pytest
 
-from flowrec.core.errors import FlowrecError, RigError, UsageError
-from flowrec.core.messages import Applied, Currents, Measured
-from flowrec.physics.chip.io import chip_files, load_chip
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted
+from flowrec.core import Applied, Currents, FlowrecError, Measured, RigError, UsageError
+from flowrec.physics import chip_files, load_chip
+from flowrec.rigs import CameraInfo, Grabbed, Wanted, checked_images
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from flowrec.rigs.lab.rig import LabRig
-from flowrec.rigs.rig import checked_images
-from flowrec.stages.config import ResolvedConfig, load_config
-from flowrec.stages.pipeline import assemble
+from flowrec.stages import ResolvedConfig, Sight, assemble, load_config, look
 from flowrec.stages.resolve import resolve
-from flowrec.stages.sight import Sight, look
 from flowrec.verbs.record import record
 from tests.conftest import HANG_S, until
 from tests.extras import why

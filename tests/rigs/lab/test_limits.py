@@ -10,18 +10,14 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from flowrec.core.declarations import as_read
-from flowrec.core.errors import RigError, UsageError
-from flowrec.core.messages import Currents, Measured
-from flowrec.physics.robot import Robot
+from flowrec.core import Currents, Measured, RigError, UsageError, as_read
+from flowrec.physics import Robot
+from flowrec.rigs import CommandLimits
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits, ReadBack
+from flowrec.rigs.lab.amplifiers.limits import ReadBack
 from flowrec.rigs.lab.amplifiers.serial_protocol import field_line
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
-from flowrec.stages.control.amplifier import AmplifierSettings
-from flowrec.stages.control.coils import Coils
-from flowrec.stages.control.field_rotation import FieldCommand
-from flowrec.stages.rig_settings import OutputLimits
+from flowrec.stages import AmplifierSettings, Coils, FieldCommand, OutputLimits
 
 RATE_HZ = 2500.0
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=500.0, step_out_hz=30.0)

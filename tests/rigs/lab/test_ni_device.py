@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError, UsageError
-from flowrec.rigs.lab.amplifiers.limits import CommandLimits
-from flowrec.stages.rig_settings import OutputLimits
+from flowrec.core import RigError, UsageError
+from flowrec.rigs import CommandLimits
+from flowrec.stages import OutputLimits
 from tests.extras import why
 from tests.perf.guardian_trial import COILS, ROBOT
 

@@ -2,9 +2,7 @@
 
 import pytest
 
-from flowrec.stages.control import Controller
-from flowrec.stages.control.controller import CONTROLLERS
-from flowrec.stages.outside_settings import with_row
+from flowrec.stages import CONTROLLERS, Controller, with_row
 
 
 @pytest.fixture(params=CONTROLLERS.usable())

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.core.messages import Estimate, FlowField, Mission, Route
-from flowrec.core.units import nanoseconds
-from flowrec.physics.robot import Robot
+from flowrec.core import Estimate, FlowField, Mission, Route, nanoseconds
+from flowrec.physics import Robot
 
 CENTRE_UM = np.array([2500.0, 2500.0])
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=2000.0, step_out_hz=200.0, step_out_margin=1.0, delay_s=0.04)

@@ -5,11 +5,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import Demand, Route
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.stages.control import Controller
-from flowrec.stages.control.controller import CONTROLLERS
+from flowrec.core import Demand, Route, UsageError
+from flowrec.physics import clearance_um
+from flowrec.stages import CONTROLLERS, Controller
 from tests.stages.control.plant import ROBOT, field_of, fly, mission, straight, vortex
 
 START_UM = (700.0, 2600.0)

@@ -7,16 +7,22 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from flowrec.core.enums import Outcome, Phase
-from flowrec.core.system.toml_file import parse_toml
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import AS_STATED, ORIENTATIONS
-from flowrec.rigs.rig import checked_images
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.stages.config import config_from_toml, load_config, to_toml
-from flowrec.stages.control.coils import Coils
-from flowrec.stages.control.motion_axes import MotionOfRun, coil_settings, orientation_by_motion, own_gain
-from flowrec.stages.pipeline import Tick, assemble, step
+from flowrec.core import Outcome, Phase, parse_toml
+from flowrec.physics import AS_STATED, ORIENTATIONS, load_chip
+from flowrec.rigs import SimulatedRig, checked_images
+from flowrec.stages import (
+    Coils,
+    MotionOfRun,
+    assemble,
+    config_from_toml,
+    load_config,
+    orientation_by_motion,
+    own_gain,
+    step,
+    to_toml,
+)
+from flowrec.stages.control.motion_axes import coil_settings
+from flowrec.stages.pipeline import Tick
 from flowrec.stages.resolve import resolve
 
 SETS = ["simulated.seed=1", "simulated.world=kind", "mission.phases=survey"]

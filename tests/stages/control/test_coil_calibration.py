@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from flowrec.core.errors import UsageError
-from flowrec.core.system.outputs import OutputError
+from flowrec.core import OutputError, UsageError
+from flowrec.measure import windings_matrix
 from flowrec.measure.calibrate_coils import calibrate_coils, settings_of
 from flowrec.measure.coil_calibration import Excitations, advice, fit_coils, read_excitations
-from flowrec.measure.coil_windings import winding_of, windings_matrix
+from flowrec.measure.coil_windings import winding_of
 from flowrec.measure.proposal import as_sets
-from flowrec.stages.config import load_config
+from flowrec.stages import load_config
 from tests.conftest import invoke
 
 A = np.array([[2.1, 0.1, -0.05], [0.08, 1.9, 0.1], [0.02, -0.1, 1.5]])

@@ -6,11 +6,8 @@ import itertools
 import numpy as np
 import pytest
 
-from flowrec.core.errors import MovieError, UsageError
-from flowrec.stages.control import Coils
-from flowrec.stages.control.coil_log import current_columns, read_coil_log
-from flowrec.stages.control.field_log import FieldLog
-from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.core import MovieError, UsageError
+from flowrec.stages import Coils, FieldCommand, FieldLog, FieldState, current_columns, field_motion, read_coil_log
 from flowrec.stages.rig_settings import Columns
 
 MT_PER_A = ((2.1, 0.1, 0.0), (0.0, 1.9, -0.2), (0.05, 0.0, 1.5))

@@ -5,15 +5,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import Currents, Demand
-from flowrec.core.summary import verdict_lines
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.robot import Robot
-from flowrec.stages.config import load_config
-from flowrec.stages.control import Coils
-from flowrec.stages.control.amplifier import AmplifierSettings
-from flowrec.stages.control.coils import field_limits
+from flowrec.core import Currents, Demand, UsageError, verdict_lines
+from flowrec.physics import Robot, load_chip
+from flowrec.stages import AmplifierSettings, Coils, field_limits, load_config
 from flowrec.stages.resolve import resolve
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=20.0, step_out_margin=0.9)

@@ -9,13 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from flowrec.core.messages import Demand
-from flowrec.core.units import wrap_rad
-from flowrec.physics.robot import Robot
-from flowrec.stages.control import Coils
-from flowrec.stages.control.amplifier import AmplifierSettings
-from flowrec.stages.control.coils import field_limits
-from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.core import Demand, wrap_rad
+from flowrec.physics import Robot
+from flowrec.stages import AmplifierSettings, Coils, FieldCommand, FieldState, field_limits, field_motion
 from tests.stages.control.waveform import block, outputs, tail
 
 SKEWED = ((2.1, 0.1, -0.05), (0.08, 1.9, 0.1), (0.02, -0.1, 1.5))

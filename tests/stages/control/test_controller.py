@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Demand, Estimate, Route
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.stages.control import Controller
+from flowrec.core import Demand, Estimate, Route
+from flowrec.physics import clearance_um
+from flowrec.stages import Controller
 from flowrec.stages.control.controller import wall_barrier
 from flowrec.stages.control.delay_compensation import CorrectedFlow, corrected_flow, predict_position
 from flowrec.stages.control.tracking_laws import Situation

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowrec.stages.control.field_log import FieldLog
-from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.stages import FieldCommand, FieldLog, FieldState, field_motion
 
 MS = 1_000_000
 ROWS = st.lists(

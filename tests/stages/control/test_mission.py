@@ -7,18 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core.messages import (
-    Applied,
-    Demand,
-    Estimate,
-    FlowField,
-    Mission,
-    Observations,
-    OperatorEvent,
-    Route,
-    Track,
-)
-from flowrec.physics.robot import Robot
+from flowrec.core import Applied, Demand, Estimate, FlowField, Mission, Observations, OperatorEvent, Route, Track
+from flowrec.physics import Robot
 from flowrec.stages.control.mission import MissionStateMachine
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowrec.core.messages import Mission, Route
+from flowrec.core import Mission, Route
 from tests.stages.control.test_mission import GOAL, ROBOT, World, field, route
 
 AWAY = (800.0, 500.0)

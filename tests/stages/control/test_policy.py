@@ -3,18 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import Estimate, Route
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.physics.flow.sampling import sample
-from flowrec.physics.robot import Robot
-from flowrec.stages.config import load_config
-from flowrec.stages.control import Controller
+from flowrec.core import Estimate, Route, UsageError
+from flowrec.physics import Robot, clearance_um, sample
+from flowrec.stages import Controller, Planner, load_config
 from flowrec.stages.control.controller import clearance_and_slope
 from flowrec.stages.control.policy import distance_to_known, steepest_descent
-from flowrec.stages.planning import Planner
 from flowrec.stages.planning.time_field import TimeField
-from flowrec.store.reader import SessionReader
+from flowrec.store import SessionReader
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL
 from tests.stages.control.plant import field_of, fly, mission, straight

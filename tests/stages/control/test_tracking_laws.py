@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Estimate, Route
-from flowrec.stages.control import Controller
-from flowrec.stages.control.controller import CONTROLLERS
+from flowrec.core import Estimate, Route
+from flowrec.stages import CONTROLLERS, Controller
 from flowrec.stages.control.delay_compensation import corrected_flow
 from flowrec.stages.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback
 from flowrec.stages.control.trajectory import feasible_pace, nearest_time

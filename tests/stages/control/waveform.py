@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.messages import Currents
-from flowrec.stages.control.coils import Coils
-from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.core import Currents
+from flowrec.stages import Coils, FieldCommand, FieldState, field_motion
 
 BLOCK_S = 0.01  # of a buffered output: two of them queued make 20 ms of the delay from command to motion
 

@@ -2,9 +2,7 @@
 
 import pytest
 
-from flowrec.stages.estimation import Observer
-from flowrec.stages.estimation.observer import OBSERVERS
-from flowrec.stages.outside_settings import with_row
+from flowrec.stages import OBSERVERS, Observer, with_row
 
 
 @pytest.fixture(params=OBSERVERS.usable())

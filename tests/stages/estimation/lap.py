@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.messages import Applied, Estimate, FlowField, Track
-from flowrec.physics.robot import Robot
-from flowrec.stages.estimation import Observer
+from flowrec.core import Applied, Estimate, FlowField, Track
+from flowrec.physics import Robot
+from flowrec.stages import Observer
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
 RATE_HZ = 30.0

@@ -5,10 +5,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import Estimate
-from flowrec.stages.estimation import Observer
-from flowrec.stages.estimation.observer import OBSERVERS
+from flowrec.core import Estimate, UsageError
+from flowrec.stages import OBSERVERS, Observer
 from tests.stages.estimation.lap import ROBOT, driven, vortex
 
 FRAMES = 90

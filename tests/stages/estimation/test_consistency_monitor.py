@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Estimate, Health
-from flowrec.core.topics import Tick
+from flowrec.core import Estimate, Health, Tick
+from flowrec.stages import HealthMonitor, Kalman, Observer
 from flowrec.stages.control.events import event_of
-from flowrec.stages.estimation import HealthMonitor, Kalman, Observer
 from tests.stages.estimation.lap import ROBOT, driven, vortex
 from tests.store.made_up import encode
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.measure.motion_fit import MotionFit, fit_motion
+from flowrec.core import UsageError
+from flowrec.measure import MotionFit
+from flowrec.measure.motion_fit import fit_motion
 from flowrec.measure.motion_search import SearchRange
 
 ANYWHERE = SearchRange(least_rate=0.7, largest_rate=1.0 / 0.7)

@@ -12,9 +12,9 @@ from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from flowrec.core.declarations import as_read
-from flowrec.core.messages import Applied, Estimate, FlowField, Track
-from flowrec.stages.estimation import HealthMonitor, Kalman, Luenberger, Observer, Sampler
+from flowrec.core import Applied, Estimate, FlowField, Track, as_read
+from flowrec.stages import HealthMonitor, Kalman, Luenberger, Observer
+from flowrec.stages.estimation import Sampler
 from flowrec.stages.estimation.process_model import StateLayout, advance_covariance, propagate
 from tests.stages.estimation.lap import RATE_HZ, ROBOT, across, lemniscate, vortex
 

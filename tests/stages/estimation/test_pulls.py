@@ -15,12 +15,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flowrec.core.messages import Applied, Estimate, Observations, Track
-from flowrec.core.units import seconds
-from flowrec.physics.robot import Robot
-from flowrec.stages.estimation import Kalman, Sampler
-from flowrec.stages.estimation.kalman import memory_s
-from flowrec.stages.estimation.smoother import observe, smooth
+from flowrec.core import Applied, Estimate, Observations, Track, seconds
+from flowrec.physics import Robot
+from flowrec.stages import Kalman, memory_s, observe, smooth
+from flowrec.stages.estimation import Sampler
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
 DT, PACE_UM_S = 1.0 / 30.0, 300.0

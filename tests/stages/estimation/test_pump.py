@@ -7,15 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import PUMP, SAMPLES, STREAMS, FlowField, Observations, PumpShare, Samples, StreamStates
-from flowrec.core.topics import Tick
-from flowrec.core.units import NS_PER_S
-from flowrec.physics.chip.chip import Chip, Opening
-from flowrec.physics.chip.fluid import PowerLaw
-from flowrec.physics.flow.sampling import sample
-from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.estimation.pump import PumpFollower, as_planned, at_pump
+from flowrec.core import (
+    NS_PER_S,
+    PUMP,
+    SAMPLES,
+    STREAMS,
+    FlowField,
+    Observations,
+    PumpShare,
+    Samples,
+    StreamStates,
+    Tick,
+    UsageError,
+)
+from flowrec.physics import Chip, FlowSolver, Opening, PowerLaw, sample
+from flowrec.stages import as_planned
+from flowrec.stages.estimation.pump import PumpFollower, at_pump
 from flowrec.stages.estimation.superposition import Superposition, at_share
 
 STEP_S = 0.04

@@ -9,15 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Applied, Estimate, FlowField, Health
-from flowrec.core.topics import Tick
-from flowrec.physics.robot import Robot
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.stages.config import Config, load_config
+from flowrec.core import Applied, Estimate, FlowField, Health, Tick
+from flowrec.physics import Robot
+from flowrec.rigs import SimulatedRig
+from flowrec.stages import Config, HealthMonitor, Pipeline, load_config
 from flowrec.stages.control.events import event_of
-from flowrec.stages.estimation import HealthMonitor
-from flowrec.stages.pipeline import Pipeline
-from flowrec.store.reader import SessionReader
+from flowrec.store import SessionReader
 from flowrec.verbs import session_replay as replay
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL

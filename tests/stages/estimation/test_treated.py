@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.declarations import as_read
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import Applied, Observations, Track
-from flowrec.physics.robot import Robot
-from flowrec.stages.estimation import Kalman, Observer, Sampler, Trimmed, observe, smooth
-from flowrec.stages.estimation.sampler import SAMPLERS
+from flowrec.core import Applied, Observations, Track, UsageError, as_read
+from flowrec.physics import Robot
+from flowrec.stages import SAMPLERS, Kalman, Observer, Trimmed, observe, smooth
+from flowrec.stages.estimation import Sampler
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
 DT = 1.0 / 30.0

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import Applied, Track
-from flowrec.measure.tuning import moving_noise, parked_noise, tune
-from flowrec.stages.estimation import Kalman, Observer, smooth
+from flowrec.core import Applied, Track, UsageError
+from flowrec.measure import tune
+from flowrec.measure.tuning import moving_noise, parked_noise
+from flowrec.stages import Kalman, Observer, smooth
 from tests.stages.estimation.lap import ROBOT, driven, vortex
 
 

@@ -2,8 +2,7 @@
 
 import pytest
 
-from flowrec.stages.outside_settings import with_row
-from flowrec.stages.planning import PLANNERS, Planner
+from flowrec.stages import PLANNERS, Planner, with_row
 from flowrec.stages.planning.planner import RrtSettings
 from tests.extras import why
 

@@ -4,11 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.messages import FlowField
-from flowrec.stages.planning import Planner, travel_time
+from flowrec.core import FlowField, UsageError
+from flowrec.stages import Planner, time_field, travel_time
 from flowrec.stages.planning.cost_rasters import CostRasters
-from flowrec.stages.planning.eikonal import time_field
 from flowrec.stages.planning.time_field import extend_to_walls
 from tests.extras import why
 from tests.stages.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, open_water, poiseuille, robot
@@ -215,7 +213,7 @@ def test_saving_energy_takes_longer_and_spends_less():
     def energy(route, idle):
         legs, dt = np.diff(route.waypoints_um, axis=0), np.diff(route.arrival_s)
         middles = 0.5 * (route.waypoints_um[1:] + route.waypoints_um[:-1])
-        from flowrec.physics.flow.sampling import sample
+        from flowrec.physics import sample
 
         swum = legs / dt[:, None] - sample(field, middles)
         return float(((swum**2).sum(1) + idle**2) @ dt)

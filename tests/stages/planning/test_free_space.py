@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flowrec.stages.planning import Planner
-from flowrec.stages.planning.free_space import FastFlowMargin, open_space
+from flowrec.stages import Planner, open_space
+from flowrec.stages.planning.free_space import FastFlowMargin
 from tests.stages.planning.worlds import PX, channel, chip_of, downstream, field_of, poiseuille, robot
 
 FAST = FastFlowMargin(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)

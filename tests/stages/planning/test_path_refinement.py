@@ -1,8 +1,7 @@
 import numpy as np
 
-from flowrec.stages.planning import travel_time
+from flowrec.stages import refine_path, travel_time
 from flowrec.stages.planning.cost_rasters import CostRasters
-from flowrec.stages.planning.path_refinement import refine_path
 from tests.stages.planning.worlds import field_of, open_water
 
 

@@ -4,11 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.declarations import as_read
-from flowrec.core.errors import FlowError, UsageError
-from flowrec.core.interpolation import bilinear
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.stages.planning import Planner, travel_time
+from flowrec.core import FlowError, UsageError, as_read, bilinear
+from flowrec.physics import clearance_um
+from flowrec.stages import Planner, travel_time
 from tests.stages.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, open_water, poiseuille, robot
 
 START, GOAL = np.array([200.0, 250.0]), np.array([950.0, 620.0])

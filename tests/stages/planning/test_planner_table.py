@@ -5,11 +5,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.core.interpolation import bilinear
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.stages.config import load_config
-from flowrec.stages.planning import PLANNERS, Planner, travel_time
+from flowrec.core import UsageError, bilinear
+from flowrec.physics import clearance_um
+from flowrec.stages import PLANNERS, Planner, load_config, travel_time
 from flowrec.stages.planning.free_space import FastFlowMargin
 from tests.stages.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, open_water, robot
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from flowrec.physics.flow.uncertainty import FlowUncertainty
-from flowrec.stages.planning import Planner
-from flowrec.stages.planning.replanning import better_route, route_elsewhere
+from flowrec.physics import FlowUncertainty
+from flowrec.stages import Planner, better_route, route_elsewhere
 from tests.stages.planning.worlds import loop, robot
 
 WEST, EAST = (60.0, 205.0), (1330.0, 205.0)

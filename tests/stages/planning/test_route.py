@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from flowrec.stages.planning import travel_time
+from flowrec.stages import travel_time
 from tests.stages.planning.worlds import channel, field_of, open_water, poiseuille
 
 

@@ -3,8 +3,8 @@ import sys
 import numpy as np
 import pytest
 
-from flowrec.core.errors import UsageError
-from flowrec.stages.planning import Planner
+from flowrec.core import UsageError
+from flowrec.stages import Planner
 from flowrec.stages.planning.planner import RrtSettings
 from tests.extras import why
 from tests.stages.planning.worlds import loop, robot

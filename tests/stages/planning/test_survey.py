@@ -1,12 +1,8 @@
 import numpy as np
 import pytest
 
-from flowrec.core.interpolation import bilinear
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.clearance import clearance_um, opening_point_um
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.flow.sampling import sample
-from flowrec.physics.flow.solver import FlowSolver
+from flowrec.core import bilinear
+from flowrec.physics import ChipSettings, FlowSolver, clearance_um, load_chip, opening_point_um, sample
 from tests.stages.planning.worlds import PX, channel, chip_of, downstream, field_of, length_um, loop, robot
 
 

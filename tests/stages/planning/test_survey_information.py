@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.interpolation import nearest_pixels
-from flowrec.core.messages import Observations
-from flowrec.physics.chip.chip import Opening
-from flowrec.physics.flow.uncertainty import Doubts, FlowUncertainty, Registration
-from flowrec.stages.planning.survey import SurveyPlanner
-from flowrec.stages.planning.survey_design import Looks, Need, Sampling, SurveyOrder, covariance_after
+from flowrec.core import Observations, nearest_pixels
+from flowrec.physics import Doubts, FlowUncertainty, Opening, Registration
+from flowrec.stages import Need, Sampling, SurveyOrder, SurveyPlanner, covariance_after
+from flowrec.stages.planning.survey_design import Looks
 from tests.stages.planning.worlds import PX, chip_of, field_of, length_um, robot
 
 SPEED_UM_S = 60.0

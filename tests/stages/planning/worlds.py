@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from flowrec.core.messages import FlowField
-from flowrec.physics.chip.chip import Chip, Opening
-from flowrec.physics.robot import Robot
-from flowrec.stages.planning import SurveyPlanner
-from flowrec.stages.planning.survey_design import SurveyOrder
+from flowrec.core import FlowField
+from flowrec.physics import Chip, Opening, Robot
+from flowrec.stages import SurveyOrder, SurveyPlanner
 
 PX = 10.0
 

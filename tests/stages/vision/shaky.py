@@ -5,10 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from flowrec.core.messages import Frame
-from flowrec.physics.chip.chip import Chip, Opening
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.robot import Robot
+from flowrec.core import Frame
+from flowrec.physics import Calibration, Chip, Opening, Robot
 
 UM_PER_PX = 4.0
 WIDTH, HEIGHT = 200, 150

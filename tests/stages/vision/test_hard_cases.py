@@ -4,11 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Frame
-from flowrec.physics.chip.chip import Chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.robot import Robot
-from flowrec.stages.vision import Tracker
+from flowrec.core import Frame
+from flowrec.physics import Calibration, Chip, Robot
+from flowrec.stages import Tracker
 
 WIDTH, HEIGHT, TOP, UM = 320, 256, 50, 10.0
 

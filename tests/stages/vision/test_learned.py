@@ -14,14 +14,11 @@ import pytest
 import flowrec
 from flowrec.bench.robot_movies import Exposure, RobotMovie, disc, judges, movie, ring, spot, wander
 from flowrec.bench.robot_tracking import by_flowrec, recorded_movies, row
-from flowrec.core.messages import Appearance, Frame, Track
-from flowrec.physics.chip.chip import Chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.robot import Robot
-from flowrec.stages.config import calibration_of, load_config
-from flowrec.stages.vision import Tracker
+from flowrec.core import Appearance, Frame, Track
+from flowrec.physics import Calibration, Chip, Robot
+from flowrec.stages import Tracker, calibration_of, load_config
 from flowrec.stages.vision.learned import Candidates, ExpectedMotion, assign_objects
-from flowrec.store.reader import SessionReader
+from flowrec.store import SessionReader
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL

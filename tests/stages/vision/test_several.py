@@ -7,7 +7,8 @@ import pytest
 
 from flowrec.core import Frame, Track, UsageError
 from flowrec.physics import Calibration, Chip, Robot
-from flowrec.stages.vision import Expected, Tracker
+from flowrec.stages import Tracker
+from flowrec.stages.vision import Expected
 
 UM, RADIUS_PX = 10.0, 6.0
 MASK = np.zeros((120, 200), bool)

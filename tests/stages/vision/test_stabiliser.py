@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.messages import Shift, Track
-from flowrec.physics.chip.chip import Chip
-from flowrec.stages.config import load_config
-from flowrec.stages.vision import Stabiliser, Tracker, move_neighbours
+from flowrec.core import Shift, Track
+from flowrec.physics import Chip
+from flowrec.stages import Tracker, load_config
+from flowrec.stages.vision import Stabiliser, move_neighbours
 from flowrec.stages.vision.walls import Walls
 from tests.short_missions import SMALL
 from tests.stages.vision.shaky import CALIBRATION, ROBOT, chip, frame, image

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.messages import Appearance, Track
-from flowrec.stages.vision.track_quality import TrackQuality
+from flowrec.core import Appearance, Track
+from flowrec.stages import TrackQuality
 from tests.stages.vision.shaky import CALIBRATION, HEIGHT, ROBOT, UM_PER_PX, WIDTH
 
 

@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flowrec.core.messages import Frame, Track
-from flowrec.physics.chip.chip import ChipSettings
-from flowrec.physics.chip.clearance import clearance_um
-from flowrec.physics.chip.io import load_chip
-from flowrec.physics.chip.registration import Calibration
-from flowrec.physics.robot import Robot
+from flowrec.core import Frame, Track
+from flowrec.physics import Calibration, ChipSettings, Robot, clearance_um, load_chip
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.stages.rig_settings import ResolvedCamera
-from flowrec.stages.simulated_settings import SimulatedImage
-from flowrec.stages.vision import Tracker
+from flowrec.stages import ResolvedCamera, SimulatedImage, Tracker
 
 CHIP = load_chip(ChipSettings())
 WALLS = clearance_um(CHIP.mask, CHIP.um_per_px)

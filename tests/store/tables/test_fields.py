@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.errors import UsageError
-from flowrec.core.messages.slow_stages import fluid_of
+from flowrec.core import UsageError, fluid_of
 
 GOLDEN = Path(__file__).parents[3] / "sessions" / "golden.mcap"
 
@@ -77,7 +76,7 @@ def test_any_image_is_read_by_its_number_and_a_loop_reads_all_of_them() -> None:
 def test_xarray_reads_images_fields_and_stamps_back_from_zarr(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import xarray
 
-    from flowrec.stages.config import load_config
+    from flowrec.stages import load_config
     from tests.short_missions import SMALL
 
     path = flowrec.record(load_config(None, [*SMALL, "duration_s=0.3"]), tmp_path / "a.mcap").path

@@ -11,16 +11,21 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core.declarations import as_read, message_fields, summary_of
-from flowrec.core.errors import SessionError
-from flowrec.core.messages import Applied, Currents, Estimate
-from flowrec.core.topics import BY_FIELD, TOPICS, Tick
-from flowrec.core.units import unit_of
-from flowrec.store.session import Session
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.table_columns import columns_of
+from flowrec.core import (
+    BY_FIELD,
+    TOPICS,
+    Applied,
+    Currents,
+    Estimate,
+    SessionError,
+    Tick,
+    as_read,
+    message_fields,
+    summary_of,
+    unit_of,
+)
+from flowrec.store import Session, SessionWriter, WriterOptions, columns_of
 from flowrec.store.tables import Tables
-from flowrec.store.writer import SessionWriter
 from tests.store.drafts import made_up
 from tests.store.hostile import STATE, file_of, with_message
 from tests.store.made_up import HEADER, encode
@@ -168,7 +173,7 @@ def test_a_message_that_makes_no_sense_is_an_error_in_a_table_too(tmp_path: Path
 
 
 def test_a_run_in_parts_has_the_table_of_the_whole(tmp_path: Path) -> None:
-    from flowrec.stages.config import load_config
+    from flowrec.stages import load_config
     from tests.short_missions import SMALL
 
     whole = flowrec.record(load_config(None, [*SMALL, "duration_s=0.4", "recording.split_s=0.1"]), tmp_path / "a.mcap")

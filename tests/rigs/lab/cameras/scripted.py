@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flowrec.core.errors import RigError
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted
+from flowrec.core import RigError
+from flowrec.rigs import CameraInfo, Grabbed, Wanted
 
 INFO = CameraInfo("Scripted", "1", 4, 3, 8, 100.0, id_bits=16)
 WANTED = Wanted(width_px=4, height_px=3, rate_hz=100.0)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError
-from flowrec.rigs.lab.cameras.camera import Grabbed, Wanted
+from flowrec.core import RigError
+from flowrec.rigs import Grabbed, Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from tests.conftest import until
 from tests.extras import why

@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core.diagnostics import CameraLosses
-from flowrec.core.errors import RigError
-from flowrec.rigs.lab.cameras.camera import Wanted
+from flowrec.core import CameraLosses, RigError
+from flowrec.rigs import Wanted
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from tests.conftest import HANG_S
 from tests.rigs.lab.cameras.scripted import GONE, INFO, WANTED, Scripted, Step, block

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError
-from flowrec.rigs.lab.cameras.camera import Wanted
+from flowrec.core import RigError
+from flowrec.rigs import Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from flowrec.rigs.lab.cameras.opencv import OpencvCamera
 from tests.rigs.lab.cameras.watching import absent, adds_up, frames_of

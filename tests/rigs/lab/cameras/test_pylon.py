@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core.errors import RigError
-from flowrec.rigs.lab.cameras.camera import Wanted
+from flowrec.core import RigError
+from flowrec.rigs import Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from tests.extras import why
 from tests.rigs.lab.cameras.watching import adds_up, frames_of

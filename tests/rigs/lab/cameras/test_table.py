@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.core.errors import RigError, UsageError
-from flowrec.rigs.lab.cameras.camera import Wanted, difference, find_device, wanted_of
-from flowrec.stages.config import load_config
-from flowrec.stages.rig_settings import CAMERAS, Lab, ResolvedCamera
+from flowrec.core import RigError, UsageError
+from flowrec.rigs import Wanted
+from flowrec.rigs.lab.cameras.camera import difference, find_device, wanted_of
+from flowrec.stages import CAMERAS, Lab, ResolvedCamera, load_config
 
 PACKAGES = {"genicam": "viva_genicam", "pylon": "pypylon", "mmcore": "pymmcore_plus"}
 PROJECT = Path(__file__).parents[4] / "pyproject.toml"

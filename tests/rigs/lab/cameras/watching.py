@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from flowrec.core.diagnostics import CameraLosses
+from flowrec.core import CameraLosses
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 
 HANG_S = 30.0  # a test that waits longer than this has failed
