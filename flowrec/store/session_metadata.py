@@ -18,6 +18,7 @@ from mcap.records import Attachment, Metadata, Statistics
 from flowrec.core import NS_PER_S, SessionError, __version__, nanoseconds, parse_toml
 from flowrec.store.mcap_format import Summary
 from flowrec.store.mcap_reader import ForeignError, McapReader
+from flowrec.store.older_files import outcome_of_today
 
 if TYPE_CHECKING:
     from flowrec.physics import Chip
@@ -203,7 +204,7 @@ class SessionMetadata:
             )
         self.flowrec_version = records[SESSION].get("flowrec_version", "?")[:_SHOWN]
         self._check_version(records[SESSION].get("format_version", ""))
-        self.outcome = records.get(OUTCOME, {})
+        self.outcome = outcome_of_today(records.get(OUTCOME, {}))
         self.digest = records.get(DIGEST)
         with self.source.parsing(0):
             self.part = _part_of(records)
