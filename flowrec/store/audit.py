@@ -14,7 +14,7 @@ from mcap.records import ChunkIndex, Metadata
 from flowrec.core import FIXED, Message, SessionError, TopicTable, printable, seconds
 from flowrec.store.channels import SessionContents
 from flowrec.store.digest import HEAD, channel_digest, head_digest, sum_text, topic_text
-from flowrec.store.gathered_copies import GatheredCopies
+from flowrec.store.lookup import GatheredCopies
 from flowrec.store.mcap_format import Record
 from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
 from flowrec.store.roi import Region

@@ -20,7 +20,7 @@ from flowrec.core import BY_PATH, Applied, Message, Outcome, SessionError, Timin
 from flowrec.store.channels import SLOTS, VIEWED, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.gathered_copies import is_copy
+from flowrec.store.lookup import is_copy
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, Record, SealedChunk, records_in
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.older_files import FORMER_RECORDS

@@ -32,8 +32,7 @@ from mcap.records import (
 
 from flowrec.core import MOVIE_FILES, SessionError
 from flowrec.store.byte_source import open_bytes
-from flowrec.store.gathered_copies import GatheredCopies, complement
-from flowrec.store.lookup_record import Piece, parse_lookup, place_of_lookup
+from flowrec.store.lookup import GatheredCopies, Piece, complement, parse_lookup, place_of_lookup
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
     CHUNK_HEAD,

@@ -35,7 +35,7 @@ from mcap.records import (
 
 from flowrec.core import SessionError, open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
-from flowrec.store.lookup_record import LOOKUP_OPCODE, SMALL_BYTES, Piece, lookup_record
+from flowrec.store.lookup import LOOKUP_OPCODE, SMALL_BYTES, Piece, lookup_record
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary, parse_summary
 
 _BUFFERS_PER_WRITE = 1024  # IOV_MAX of Linux

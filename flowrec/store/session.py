@@ -27,10 +27,10 @@ from flowrec.core import (
     text_for_picture,
     verdict_lines,
 )
+from flowrec.store.byte_source import session_path
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
-from flowrec.store.session_path import session_path
 
 if TYPE_CHECKING:
     import numpy as np

@@ -29,7 +29,7 @@ from flowrec.core.units import NS_PER_S
 from flowrec.store.channels import FRAME_PATH, SLOTS, declarations
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.gathered_copies import gather
+from flowrec.store.lookup import gather
 from flowrec.store.mcap_format import ChannelIndex, SealedChunk
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.session_metadata import OUTCOME, PROFILE, header_records

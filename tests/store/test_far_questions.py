@@ -14,8 +14,7 @@ from mcap.reader import NonSeekingReader, make_reader
 import flowrec
 from flowrec.core.errors import UsageError
 from flowrec.store.channels import SessionContents
-from flowrec.store.gathered_copies import GatheredCopies, is_copy
-from flowrec.store.lookup_record import LOOKUP_OPCODE
+from flowrec.store.lookup import LOOKUP_OPCODE, GatheredCopies, is_copy
 from flowrec.store.mcap_format import CRC, RECORD_HEAD
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.recovery import recover
