@@ -25,7 +25,7 @@ from mcap.writer import Writer
 
 from flowrec.core.errors import SessionError
 from flowrec.core.messages import Currents
-from flowrec.store import channels, file_reader, session_metadata
+from flowrec.store import channels, merged_chunks, session_metadata
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
@@ -327,7 +327,7 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_named(tmp_path, session
 
 def test_a_reading_that_is_abandoned_waits_for_no_thread_whichever_it_is_collected_in():
     def reading():
-        with file_reader._threads() as executor:
+        with merged_chunks.threads() as executor:
             yield executor
 
     busy, abandoned = threading.Event(), reading()
