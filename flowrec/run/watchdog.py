@@ -100,7 +100,7 @@ class Watchdog:
             self.apply(currents)
 
     def go_on(self) -> None:
-        """Let the commands from now on pass again: the loop has taken in why the field was to rest."""
+        """Let commands pass again: the loop knows why the field was taken away."""
         self._resting = False
 
     def tick_ended(self) -> None:

@@ -94,7 +94,7 @@ def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: 
 
     Parameters
     ----------
-    looked_at : the same configuration with the log where it overlaps the movie.
+    looked_at : the same configuration, with the log moved to where it overlaps the movie.
     robots : which bodies are the robots, the mission's one first: of each a number of the picture, "X,Ypx" in pixels
         of the first image, or "X,Y" in um on the chip; none: the only one that qualifies, or the one of
         tracker.click_px or box_px, or the tracker.robots most similar discs.

@@ -104,7 +104,7 @@ class Layer:
             self._mix(mask, shade, opacity)
 
     def blend(self, grey: NDArray[np.uint8], picture: Picture) -> None:
-        """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it; nothing is drawn after it."""
+        """Draw the lines in a picture (h, w, 3) of an image (h, w); no line is added afterwards."""
         where, ink = self._finished
         levels = grey.reshape(-1, 1)[where]
         picture.reshape(-1, 3)[where] = (levels * (1.0 - ink[:, 3:]) + ink[:, :3] + 0.5).astype(np.uint8)
