@@ -1,4 +1,4 @@
-"""What a file repeats at its end, so that few requests open it at a URL and look things up in it.
+"""Repetitions at the end of a file, so that few requests open it at a URL and look things up in it.
 
 The lookup record is the last record of the summary section. The index of 10 GB of small images has 3 MB, nearly all of
 which is the list of chunks, and the head of a file is at its other end; each would be another request. So the record

@@ -1,4 +1,4 @@
-"""What older files state in other words than today's; it is turned into these when a file is opened.
+"""Statements of older files in other words than today's, which are turned into these when a file is opened.
 
 The rest of what is older stands where today's is declared: settings that moved in stages/config.py; a field of a
 message, a setting or a fact of the head that came later has a default there, which means "as before".

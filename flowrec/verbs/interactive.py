@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flowrec.run import DiskMonitor, Watchdog
     from flowrec.store import SessionWriter
 
-_PERIOD_S = 0.12
+_PERIOD_S = 0.12  # of the status line: faster ones can not be read
 _CLOSE_TIMEOUT_S = 0.3  # for the last events to be shown
 _EVENTS_LIMIT = 1000  # that wait to be shown
 _COLOURS: dict[str, str] = {Level.WARNING: "yellow", Level.ERROR: "red"}

@@ -19,7 +19,6 @@ from flowrec.physics import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.stages import Coils, FieldCommand, OutputLimits, field_limits
 
-_TURN_RAD = 2.0 * math.pi
 _ROUNDING = 1e-9  # relative
 
 
@@ -155,7 +154,7 @@ class CommandLimits:
     def _turning_a_s(self) -> NDArray[np.float64]:
         """(coils,) largest rate of change of the currents while the amplitude is constant."""
         turning: NDArray[np.float64] = (
-            field_limits(self.coils).row_a_per_mt * self.amplitude_mt * _TURN_RAD * self.rotation_hz
+            field_limits(self.coils).row_a_per_mt * self.amplitude_mt * math.tau * self.rotation_hz
         )
         return turning
 

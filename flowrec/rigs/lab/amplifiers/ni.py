@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
 _START_S = 60.0  # the package of NI takes seconds to load on a busy computer, and so does a device
-_ZERO_S = 0.5
+_ZERO_S = 0.5  # time for the process to confirm zero
 _SILENT_S = 0.5  # a process that has written no block for so long is stuck
-_END_S = 5.0
+_END_S = 5.0  # time for the process to end by itself
 
 
 @dataclass(frozen=True, slots=True)
