@@ -75,14 +75,14 @@ class Parts(SegmentedRun):
         """Finish a part that is not the last."""
         file = _file_of(segment)
         file.flush(wait=True)
-        self._complete(file, self._continued(file), segment.counters)
+        self._complete(file, self._outcome_of_part(file), segment.counters)
 
     def _finish_after_failure(self, part: Segment, reason: str) -> None:
         file, last = _file_of(part), part is self.open[-1]
         part.counters.dropped_frames += part.awaited
         file.flush()
         failed = {"outcome": Outcome.FAILED, "reason": reason}
-        self._complete(file, failed if last else self._continued(file), part.counters)
+        self._complete(file, failed if last else self._outcome_of_part(file), part.counters)
 
     def _is_due(self, stamp_ns: int) -> bool:
         """True if a tick is the first one of another part."""
@@ -136,7 +136,7 @@ class Parts(SegmentedRun):
             return self._header
         return replace(self._header, part=Part(self._plan.run, self._number, keyframe_ns=keyframe_ns))
 
-    def _continued(self, file: SessionFile) -> dict[str, str]:
+    def _outcome_of_part(self, file: SessionFile) -> dict[str, str]:
         """The outcome of a part that is not the last."""
         return {"outcome": Outcome.CONTINUED, "next": part_path(self._path, part_number(file.path) + 1).name}
 
