@@ -15,8 +15,8 @@ from flowrec.core import FIXED, Message, SessionError, TopicTable, printable, se
 from flowrec.store.channels import SessionContents
 from flowrec.store.digest import HEAD, channel_digest, head_digest, sum_text, topic_text
 from flowrec.store.lookup import GatheredCopies
-from flowrec.store.mcap_format import Record
-from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
+from flowrec.store.mcap_format import DamageError, Record, UnfinishedError
+from flowrec.store.mcap_reader import McapReader
 from flowrec.store.roi import Region
 from flowrec.store.run_files import RunFile, files_of
 from flowrec.store.scan import Scan, scan

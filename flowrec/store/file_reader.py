@@ -15,8 +15,7 @@ from mcap.records import ChunkIndex
 from flowrec.core import Frame, Message, SessionError, pixel_type
 from flowrec.store.channels import Row, SessionContents
 from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
-from flowrec.store.mcap_format import Record, Summary, lone_count
-from flowrec.store.mcap_reader import DamageError
+from flowrec.store.mcap_format import DamageError, Record, Summary, lone_count
 from flowrec.store.merged_chunks import AHEAD_AT_FIRST, by_time, in_time, merge_chunks, threads
 from flowrec.store.write_queue import NewMessages
 

@@ -23,7 +23,8 @@ from flowrec.store.byte_source import on_this_machine
 from flowrec.store.channels import VIEWED, SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
 from flowrec.store.file_end import end_file
-from flowrec.store.mcap_reader import DamageError, McapReader
+from flowrec.store.mcap_format import DamageError
+from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import disk_errors, new_mcap
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import (

@@ -20,7 +20,7 @@ from typing import Self
 
 from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds
 from flowrec.store.byte_source import UrlPath, is_there, open_bytes, session_path
-from flowrec.store.mcap_reader import UnfinishedError
+from flowrec.store.mcap_format import UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata
 
 SESSION_SUFFIX = ".mcap"

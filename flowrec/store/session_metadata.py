@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Self
 from mcap.records import Attachment, Metadata, Statistics
 
 from flowrec.core import NS_PER_S, SessionError, __version__, nanoseconds, parse_toml
-from flowrec.store.mcap_format import Summary
-from flowrec.store.mcap_reader import ForeignError, McapReader
+from flowrec.store.mcap_format import ForeignError, Summary
+from flowrec.store.mcap_reader import McapReader
 from flowrec.store.older_files import outcome_of_today
 
 if TYPE_CHECKING:
