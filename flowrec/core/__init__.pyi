@@ -3,6 +3,7 @@ from .clocks.clock_monitor import (
     irregular_frames as irregular_frames, skew_ppm as skew_ppm,
 )
 from .clocks.device_clock import DeviceClock as DeviceClock, Fit as Fit, envelope as envelope
+from .closing import Closing as Closing
 from .config_tree import (
     IMAGE_SIZE as IMAGE_SIZE, NAME as NAME, Origin as Origin, REGISTRATION as REGISTRATION, apply_sets as apply_sets,
     nearest_settings as nearest_settings, place_paths as place_paths, refuse_unknown as refuse_unknown, settings_of as settings_of,

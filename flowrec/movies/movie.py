@@ -5,17 +5,17 @@ Nothing is converted silently: grey levels are those of the file, and what had t
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, PIXEL_BITS, Image, Method, Methods, MovieError, pixel_type
+from flowrec.core import NS_PER_S, PIXEL_BITS, Closing, Image, Method, Methods, MovieError, pixel_type
 from flowrec.movies.grey import grey_image
 from flowrec.movies.notes import MovieNotes
 
@@ -99,7 +99,7 @@ class MovieFacts:
         )
 
 
-class Movie(ABC):
+class Movie(Closing):
     """An open movie. Memory does not grow with its length.
 
     Attributes
@@ -168,12 +168,6 @@ class Movie(ABC):
         affordable = _MEDIAN_BYTES // (facts.width_px * facts.height_px * pixel_type(facts.bits).itemsize)
         count = max(min(count, facts.frames, affordable), 1)
         return np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int)).tolist()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def _grey(self, array: NDArray[Any], index: int) -> Image:
         """Grey levels (h, w) of an image, see `grey_image`."""

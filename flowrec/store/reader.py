@@ -8,13 +8,12 @@ import itertools
 import operator
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import COILS, Frame, SessionError, Tick, array_shapes, seconds
+from flowrec.core import COILS, Closing, Frame, SessionError, Tick, array_shapes, seconds
 from flowrec.store.byte_source import session_path
 from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
@@ -24,7 +23,7 @@ from flowrec.store.session_metadata import SessionHeader
 _OPEN_FILES = 4
 
 
-class SessionReader:
+class SessionReader(Closing):
     """A finished session, open for reading; several iterations may run at a time.
 
     X.mcap is that file or, where there is none, the run whose parts are X.part001.mcap and so on; a part or a snapshot
@@ -228,14 +227,6 @@ class SessionReader:
         self._closed = True
         for file in self._open.values():
             file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _files_with(self, fields: set[str]) -> Iterator[tuple[FileReader, int]]:
         """The files with messages of some topics, each with the stamp of its keyframe, which is skipped; else -1."""

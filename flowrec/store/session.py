@@ -8,9 +8,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from flowrec.core import (
+    Closing,
     Figures,
     FlowrecError,
     NotFiniteError,
@@ -67,7 +68,7 @@ class FlowFields(dict[str, "FlowField"]):
         return every.assign_coords(method=("field", [field.method for field in self.values()]))
 
 
-class Session:
+class Session(Closing):
     """A finished session, or one finished part of a run, open for reading; it never writes.
 
     X.mcap is that file or, if there is none, the run with the parts X.part001.mcap and so on. Times are session
@@ -290,12 +291,6 @@ class Session:
         """Close the files; nothing more can be read."""
         if "reader" in vars(self):
             self.reader.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         return f"Session({str(self.path)!r})"

@@ -11,11 +11,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from mcap.records import Attachment, Metadata, Statistics
 
-from flowrec.core import NS_PER_S, SessionError, __version__, nanoseconds, parse_toml
+from flowrec.core import NS_PER_S, Closing, SessionError, __version__, nanoseconds, parse_toml
 from flowrec.store.mcap_format import ForeignError, Summary
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.older_files import outcome_of_today
@@ -156,7 +156,7 @@ def is_header_file(name: str) -> bool:
     return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith((_WEIGHTS, _PICTURES))
 
 
-class SessionMetadata:
+class SessionMetadata(Closing):
     """The index and the metadata of a session file.
 
     Raises SessionError: it is no session file, or not one for this flowrec.
@@ -228,12 +228,6 @@ class SessionMetadata:
             if chunk.message_start_time <= stamp_ns:
                 counts.update(record.channel for record in self.source.messages(chunk) if record.log_ns <= stamp_ns)
         return self._by_topic(counts)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the file; a forgotten one is closed when it is collected."""
