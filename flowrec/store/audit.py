@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -109,7 +108,7 @@ def audit(
         contents = SessionContents(path)
     except (UnfinishedError, DamageError) as error:
         why_not = _without_advice(error, path)
-        with contextlib.closing(McapReader(path)) as source:
+        with McapReader(path) as source:
             contents = SessionContents(path, scan(source).summary)
     with contents:
         found = Audit(path, contents.source.size, not why_not, why_not, contents.flowrec_version)

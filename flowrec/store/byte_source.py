@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import sys
@@ -12,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flowrec.core import SessionError, UsageError, refuse_irregular
+from flowrec.core import Closing, SessionError, UsageError, refuse_irregular
 from flowrec.store.traffic import MissingError
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ def named_beside(session: Path, name: str) -> Path:
     return Path(name) if isinstance(session_path(session), UrlPath) else session.with_name(name)
 
 
-class LocalFile:
+class LocalFile(Closing):
     """A file on this machine, whose bytes are read by range, from several threads at a time; see RemoteFile, too.
 
     Raises SessionError: it can not be opened.
@@ -161,5 +160,5 @@ def is_there(path: Path) -> bool:
 
 def size_of(path: Path) -> int:
     """Number of bytes of a file; errors as of `open_bytes`."""
-    with contextlib.closing(open_bytes(path)) as source:
+    with open_bytes(path) as source:
         return source.size

@@ -21,7 +21,6 @@ A file without either is read where its records stand. `check` compares both wit
 from __future__ import annotations
 
 import bisect
-import contextlib
 import itertools
 import json
 import struct
@@ -205,7 +204,7 @@ def gather(path: Path, listed: Summary, start_unix_ns: int) -> Iterator[Attachme
     listed : its index, with Unix times.
     start_unix_ns : Unix time of stamp 0.
     """
-    with contextlib.closing(open_bytes(path)) as source:
+    with open_bytes(path) as source:
         for name, ranges in _pieces(_ranges(listed)):
             data = b"".join(complement(source.read(offset, length)) for offset, length in ranges)
             yield Attachment(start_unix_ns, start_unix_ns, name, _MEDIA_TYPE, data)

@@ -27,7 +27,7 @@ from mcap.records import (
     Schema,
 )
 
-from flowrec.core import MOVIE_FILES
+from flowrec.core import MOVIE_FILES, Closing
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.lookup import GatheredCopies, Piece, complement, parse_lookup, place_of_lookup
 from flowrec.store.mcap_format import (
@@ -73,7 +73,7 @@ _READ_BY = {
 }
 
 
-class McapReader:
+class McapReader(Closing):
     """An MCAP file. Reads are independent of each other and may come from several threads.
 
     `start_unix_ns`: Unix time of stamp 0 of the session, as soon as it has been read; log times are reduced by it.
@@ -81,10 +81,9 @@ class McapReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.start_unix_ns = 0
+        self.path, self.start_unix_ns = path, 0
         self._bytes = open_bytes(path)
-        self.size, self.close = self._bytes.size, self._bytes.close
+        self.size = self._bytes.size
         self._summary: Summary | None = None  # that was read to find the copies
         self._pieces: list[Piece] = []
         self._copies: GatheredCopies | None = None
@@ -95,6 +94,10 @@ class McapReader:
         except BaseException:
             self.close()
             raise
+
+    def close(self) -> None:
+        """Release the bytes."""
+        self._bytes.close()
 
     def set_start(self, unix_ns: int) -> None:
         """Set `start_unix_ns`. Raises ValueError: it is no time."""

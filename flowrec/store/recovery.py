@@ -164,7 +164,7 @@ def _recover(path: Path, out: Path | None) -> Recovered:
         _refuse_if_taken(target)
         _rename(path, target)
         return Recovered(target, intact.ticks, intact.duration_s)
-    with contextlib.closing(McapReader(path)) as source:
+    with McapReader(path) as source:
         declared = scan(source, heads_only=True)
     if partial and not declared.chunks_passed:
         raise _nothing_on_disk(path)
@@ -197,7 +197,7 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
     """Copy everything intact of a file into a new one, and complete that."""
     path = contents.source.path
     tally = RecoveryTally(contents)
-    with contextlib.closing(new_mcap(draft, overwrite=True)) as out, disk_errors(draft):
+    with new_mcap(draft, overwrite=True) as out, disk_errors(draft):
         copier = ChunkCopier(contents, out, tally)
         found = scan(contents.source, copier.visit)
         if not found.summary.chunks and path.name.endswith(PARTIAL_SUFFIX):

@@ -20,7 +20,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flowrec.core import SessionError
+from flowrec.core import Closing, SessionError
 from flowrec.store.byte_source import UrlPath
 from flowrec.store.object_requests import CONNECTIONS, Answer, ListedObject, ObjectRequests, listing, requests_for
 from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout_s
@@ -63,7 +63,7 @@ _remembered: OrderedDict[str, _Opened] = OrderedDict()
 _remembering = threading.Lock()
 
 
-class RemoteFile:
+class RemoteFile(Closing):
     """An object at a URL, whose bytes are read as those of a LocalFile.
 
     Attributes

@@ -331,7 +331,7 @@ def session_sha256(files: Sequence[Path]) -> str:
     """SHA-256 of a session, by which a replay names its parent: of its file, or of its parts in order."""
     digest = hashlib.sha256()
     for path in files:
-        with contextlib.closing(open_bytes(path)) as source:
+        with open_bytes(path) as source:
             for offset in range(0, source.size, _HASHED_BYTES):
                 source.prefetch((at, _HASHED_BYTES) for at in range(offset, offset + 4 * _HASHED_BYTES, _HASHED_BYTES))
                 digest.update(source.read(offset, min(_HASHED_BYTES, source.size - offset)))
