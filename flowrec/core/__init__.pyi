@@ -11,7 +11,7 @@ from .config_tree import (
 )
 from .coverage import Coverage as Coverage
 from .declarations import (
-    COILS as COILS, Bools as Bools, Floats as Floats, Image as Image, Ints as Ints, Matrix as Matrix, Message as Message, MessageField as MessageField, Role as Role,
+    COILS as COILS, Bools as Bools, Floats as Floats, Floats32 as Floats32, Image as Image, Ints as Ints, Matrix as Matrix, Message as Message, MessageField as MessageField, Role as Role,
     Source as Source, Topic as Topic, array_shapes as array_shapes,
     as_read as as_read, coil_names as coil_names, defaulted_fields as defaulted_fields, invalid_numbers as invalid_numbers,
     message_fields as message_fields, shape_error as shape_error, shape_fault as shape_fault,

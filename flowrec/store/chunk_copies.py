@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
-from numpy.typing import NDArray
 
-from flowrec.core import BY_PATH, Applied, Message, Outcome, SessionError, Timing, seconds
+from flowrec.core import BY_PATH, Applied, Ints, Message, Outcome, SessionError, Timing, seconds
 from flowrec.store.channels import SLOTS, VIEWED, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
@@ -138,7 +137,7 @@ class RecoveryTally:
         return {**recorded, **marks, "outcome": Outcome.CUT, "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
 
 
-def _array(times: array[int]) -> NDArray[np.int64]:
+def _array(times: array[int]) -> Ints:
     return np.frombuffer(times, np.int64) if times else np.zeros(0, np.int64)
 
 

@@ -13,7 +13,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import COILS, Closing, Frame, SessionError, Tick, array_shapes, seconds
+from flowrec.core import COILS, Closing, Frame, Ints, SessionError, Tick, array_shapes, seconds
 from flowrec.store.byte_source import session_path
 from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
@@ -267,7 +267,7 @@ class Frames(Sequence[Frame]):
         self._which = which if which is not None else range(reader.frame_count)
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> Ints:
         return np.array(self._reader.frame_stamps, np.int64)[list(self._which)]
 
     @property

@@ -7,9 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Closing, Frame, MovieError, UsageError, nanoseconds, seconds
+from flowrec.core import NS_PER_S, Closing, Frame, Ints, MovieError, UsageError, nanoseconds, seconds
 from flowrec.movies import Movie, MovieFacts, ReadOptions, frame_times, open_movie
 from flowrec.stages import Coils, FieldLog, MovieSettings, is_of_session, read_coil_log
 
@@ -143,7 +142,7 @@ class MovieSource(Closing):
         """Release the files."""
         self._movie.close()
 
-    def _stamps(self, times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _stamps(self, times_ns: Ints) -> Ints:
         """Session stamps of times on the movie's clock."""
         since, rate = times_ns - self.first_ns, self._settings.clock_rate
         return since if rate == 1.0 else np.rint(since * rate).astype(np.int64)

@@ -12,10 +12,8 @@ from multiprocessing import Pipe
 from typing import TYPE_CHECKING, Any, Self
 
 import nidaqmx  # noqa: F401  here, so that a missing package is stated before a process is started
-import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Measured, RigError, start_child
+from flowrec.core import NS_PER_S, Floats, Measured, RigError, start_child
 from flowrec.physics import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import KEEP_S, AmplifierInfo, not_before
 from flowrec.stages import Coils, FieldCommand, FieldLog, MotionSegment, OutputLimits
@@ -50,7 +48,7 @@ class Played:
     from_ns: int
     segments: tuple[MotionSegment, ...]
     amplitude_mt: float
-    currents_a: NDArray[np.float64]  # (n,) at the first sample
+    currents_a: Floats  # (n,) at the first sample
 
 
 class NiAmplifier:

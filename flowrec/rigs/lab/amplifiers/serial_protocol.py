@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowrec.core import Floats
 from flowrec.stages import Coils, FieldCommand, field_limits
 
 ZERO = b"\nZ\n"  # the newline ends a line that its writer may have left half written
@@ -40,8 +40,8 @@ class Telemetry:
     heading_rad: float  # direction in which the robot travels
     amplitude_mt: float
     turns: tuple[int, int]  # 1e-6 revolutions along x and y since the board started; wrap at 2^32
-    currents_a: NDArray[np.float64]  # (coils,)
-    measured_a: NDArray[np.float64] | None = None  # (coils,), by a board with sensors
+    currents_a: Floats  # (coils,)
+    measured_a: Floats | None = None  # (coils,), by a board with sensors
 
 
 def line(verb: str, number: int, *numbers: int) -> bytes:
