@@ -2,10 +2,7 @@ from .audit import Audit as Audit, audit as audit, digest_faults as digest_fault
 from .bucket_upload import (
     Bucket as Bucket, Content as Content, StoreError as StoreError, content_of_file as content_of_file,
 )
-from .byte_source import (
-    UrlPath as UrlPath, is_there as is_there, named_beside as named_beside, on_this_machine as on_this_machine,
-    open_bytes as open_bytes, session_path as session_path, size_of as size_of,
-)
+from .byte_source import is_there as is_there, open_bytes as open_bytes, size_of as size_of
 from .channels import FRAME_PATH as FRAME_PATH, SLOTS as SLOTS, is_left_out as is_left_out
 from .growing_run import GrowingRun as GrowingRun, live_runs as live_runs
 from .lookup import is_copy as is_copy
@@ -31,6 +28,10 @@ from .session_file import WriterOptions as WriterOptions
 from .session_metadata import (
     Part as Part, SessionHeader as SessionHeader, SessionMetadata as SessionMetadata,
     is_header_file as is_header_file,
+)
+from .session_path import (
+    UrlPath as UrlPath, named_beside as named_beside, on_this_machine as on_this_machine,
+    session_path as session_path,
 )
 from .session_writer import (
     cut_session as cut_session, frames_of as frames_of, image_bytes_s as image_bytes_s, session_header as session_header,

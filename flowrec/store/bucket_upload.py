@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.core import Closing, SessionError, UsageError
-from flowrec.store.byte_source import UrlPath
 from flowrec.store.object_requests import NOT_OFFERED, in_a_line, of_status, reason
+from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import MissingError, RefusedError, TransientError, ask_repeatedly, timeout_s
 
 _PART_BYTES = 16 << 20

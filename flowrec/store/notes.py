@@ -13,7 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flowrec.core import SessionError, UsageError, append_line, refuse_irregular
-from flowrec.store.byte_source import on_this_machine, open_bytes
+from flowrec.store.byte_source import open_bytes
+from flowrec.store.session_path import on_this_machine
 from flowrec.store.traffic import MissingError
 
 NOTES_SUFFIX = ".notes.jsonl"

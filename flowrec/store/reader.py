@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.core import COILS, Closing, Frame, Ints, SessionError, Tick, array_shapes, seconds
-from flowrec.store.byte_source import session_path
 from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader
+from flowrec.store.session_path import session_path
 
 _OPEN_FILES = 4
 

@@ -19,7 +19,6 @@ from flowrec.core import (
     refuse_irregular,
 )
 from flowrec.store.audit import disagreements, edits_of
-from flowrec.store.byte_source import on_this_machine
 from flowrec.store.channels import VIEWED, SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
 from flowrec.store.file_end import end_file
@@ -39,6 +38,7 @@ from flowrec.store.run_files import (
 from flowrec.store.scan import Scan, scan
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION, Part
+from flowrec.store.session_path import on_this_machine
 from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.writer import SessionWriter
 

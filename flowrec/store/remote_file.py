@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flowrec.core import Closing, SessionError
-from flowrec.store.byte_source import UrlPath
 from flowrec.store.object_requests import CONNECTIONS, Answer, ListedObject, ObjectRequests, listing, requests_for
+from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout_s
 
 _END_BYTES, _HEAD_BYTES = 512 << 10, 256 << 10

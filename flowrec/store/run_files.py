@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Self
 
 from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds
-from flowrec.store.byte_source import UrlPath, is_there, open_bytes, session_path
+from flowrec.store.byte_source import is_there, open_bytes
 from flowrec.store.mcap_format import UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata
+from flowrec.store.session_path import UrlPath, session_path
 
 SESSION_SUFFIX = ".mcap"
 PARTIAL_SUFFIX = ".partial"

@@ -17,15 +17,18 @@ from flowrec.core import (
     NotFiniteError,
     SessionError,
     UsageError,
+    goal_text,
     nanoseconds,
     of_text,
     parse_toml,
+    rows_for_people,
     seconds,
+    verdict_lines,
 )
-from flowrec.store.byte_source import session_path
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
+from flowrec.store.session_path import session_path
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from flowrec.store.stream_samples import Channel
     from flowrec.store.tables import Tables
 
+_CARD_FIGURES = ("tracking_error_um", "contacts", "frames_dropped", "covered")  # that no sentence states
 _LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
 
@@ -296,9 +300,18 @@ class Session(Closing):
         return f"Session({str(self.path)!r})"
 
     def _repr_html_(self) -> str:
-        from flowrec.store.session_card import card_of
+        """A card for notebooks: how the run ended, with what, and the image in its middle, or the chip without one."""
+        from flowrec.store.session_card import card
 
-        return card_of(self)
+        frames, outcome, last = self.frames, self.outcome, self.last
+        image = frames[len(frames) // 2].image if len(frames) else self.chip.mask.astype("uint8")
+        recorded = {name: self.provenance.get(name, "") for name in ("wall_time", "operator", "sample", "notes")}
+        goal = goal_text(last.mission.goal_um if last.mission is not None else None)
+        rows = [("goal", goal), ("chip", self.chip.name)]
+        rows += rows_for_people({key: outcome[key] for key in _CARD_FIGURES if key in outcome})
+        rows += [(name.replace("_", " "), value) for name, value in recorded.items() if value]
+        rows += [("topics", f"{len(self.topics)}, {sum(self.topics.values())} messages, {len(frames)} images")]
+        return card(self.path.name, rows, image, verdict_lines(outcome, last.refined))
 
 
 def open(path: Path | str) -> Session:  # noqa: A001 - flowrec.open

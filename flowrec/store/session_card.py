@@ -1,37 +1,19 @@
-"""The card of a session in notebooks: how the run ended, with what, and a picture."""
+"""The card of a session in notebooks: sentences, rows of names and values, and a picture, as HTML."""
 
 from __future__ import annotations
 
 import base64
 import html
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import goal_text, rows_for_people, text_for_picture, verdict_lines
-
-if TYPE_CHECKING:
-    from flowrec.store.session import Session
+from flowrec.core import text_for_picture
 
 _WIDTH_PX = 240  # of the picture
 _TEXT, _SENTENCE = 200, 600  # characters of a value, of a sentence
-_FIGURES = ("tracking_error_um", "contacts", "frames_dropped", "covered")  # that no sentence states
-
-
-def card_of(session: Session) -> str:
-    """The card of a session, with the image in its middle, or the chip without one."""
-    frames, outcome, last = session.frames, session.outcome, session.last
-    image = frames[len(frames) // 2].image if len(frames) else session.chip.mask.astype("uint8")
-    recorded = {name: session.provenance.get(name, "") for name in ("wall_time", "operator", "sample", "notes")}
-    goal = goal_text(last.mission.goal_um if last.mission is not None else None)
-    rows = [("goal", goal), ("chip", session.chip.name)]
-    rows += rows_for_people({key: outcome[key] for key in _FIGURES if key in outcome})
-    rows += [(name.replace("_", " "), value) for name, value in recorded.items() if value]
-    rows += [("topics", f"{len(session.topics)}, {sum(session.topics.values())} messages, {len(frames)} images")]
-    return card(session.path.name, rows, image, verdict_lines(outcome, last.refined))
 
 
 def card(

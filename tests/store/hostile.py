@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from flowrec.core.errors import SessionError, printable
-from flowrec.store.byte_source import session_path
 from flowrec.store.channels import SLOTS
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
+from flowrec.store.session_path import session_path
 from tests.store.drafts import small_draft, text
 from tests.store.range_server import served
 

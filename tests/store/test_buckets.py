@@ -13,10 +13,10 @@ import flowrec
 from flowrec.archive.sweep.tasks import content_of, session_files
 from flowrec.core.errors import FlowrecError, SessionError, UsageError
 from flowrec.store import remote_file, traffic
-from flowrec.store.byte_source import session_path
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import part_path
 from flowrec.store.session import Session
+from flowrec.store.session_path import session_path
 from flowrec.verbs.ls import ls
 from tests.conftest import invoke
 from tests.store.range_server import served

@@ -20,9 +20,9 @@ import flowrec
 from flowrec.core.errors import FlowrecError, SessionError, UsageError
 from flowrec.exports.layout import write_layouts
 from flowrec.store import remote_file, traffic
-from flowrec.store.byte_source import UrlPath, session_path
 from flowrec.store.object_requests import _redirect_target
 from flowrec.store.run_files import session_sha256
+from flowrec.store.session_path import UrlPath, session_path
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError, ask_repeatedly
 from tests.conftest import HANG_S, invoke, run
 from tests.extras import needs

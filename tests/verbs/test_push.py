@@ -22,10 +22,10 @@ from flowrec.archive.verbs import push as push_verb
 from flowrec.core.errors import FlowrecError, UsageError
 from flowrec.core.system.endings import Ended, StoppedError
 from flowrec.store import bucket_upload, remote_file, traffic
-from flowrec.store.byte_source import UrlPath
 from flowrec.store.run_files import part_path, session_sha256
 from flowrec.store.session import Session
 from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import TRAFFIC
 from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S, invoke, until

@@ -11,7 +11,7 @@ import pytest
 
 import flowrec
 from flowrec.core import UsageError
-from flowrec.store.byte_source import session_path
+from flowrec.store.session_path import session_path
 from flowrec.verbs import align
 from tests.verbs.test_cli import flowrec as command
 from tests.verbs.test_cli import one_line_error
