@@ -6,7 +6,6 @@ where the bucket has the beginning of them.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -195,7 +194,7 @@ def _read_back(url: UrlPath, file: Path, content: Content, etag: str) -> str:
     wrong = SessionError(f"{url}: does not hold what was sent; delete it, and push again")
     forget(url)
     try:
-        with contextlib.closing(open_bytes(url)) as stored, contextlib.closing(open_bytes(file)) as sent:
+        with open_bytes(url) as stored, open_bytes(file) as sent:
             if stored.size != content.size:
                 raise wrong
             if etag != content.etag:

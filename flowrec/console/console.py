@@ -21,9 +21,8 @@ from flowrec.view import Feed, FeedSink, Scene, viewer
 
 PACKAGES = ("starlette", "uvicorn", "websockets")  # of the extra `console`
 _SERVER = "flowrec.console.server"
-_MAX_HZ = 10.0
-_START_S = 30.0
-_CLOSE_S = 3.0
+_MAX_HZ = 10.0  # of what its pages are sent
+_START_S, _CLOSE_S = 30.0, 3.0  # time for its process to start, and to end
 _WITHOUT = "the run goes on without"
 STAYS = "flowrec: shows its pages how the run ended"  # what the process says last; it ends by itself a moment later
 

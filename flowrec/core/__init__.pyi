@@ -3,6 +3,7 @@ from .clocks.clock_monitor import (
     irregular_frames as irregular_frames, skew_ppm as skew_ppm,
 )
 from .clocks.device_clock import DeviceClock as DeviceClock, Fit as Fit, envelope as envelope
+from .closing import Closing as Closing
 from .config_tree import (
     IMAGE_SIZE as IMAGE_SIZE, NAME as NAME, Origin as Origin, REGISTRATION as REGISTRATION, apply_sets as apply_sets,
     nearest_settings as nearest_settings, place_paths as place_paths, refuse_unknown as refuse_unknown, settings_of as settings_of,
@@ -10,7 +11,7 @@ from .config_tree import (
 )
 from .coverage import Coverage as Coverage
 from .declarations import (
-    COILS as COILS, Bools as Bools, Floats as Floats, Image as Image, Ints as Ints, Matrix as Matrix, Message as Message, MessageField as MessageField, Role as Role,
+    COILS as COILS, Bools as Bools, Floats as Floats, Floats32 as Floats32, Image as Image, Ints as Ints, Matrix as Matrix, Message as Message, MessageField as MessageField, Role as Role,
     Source as Source, Topic as Topic, array_shapes as array_shapes,
     as_read as as_read, coil_names as coil_names, defaulted_fields as defaulted_fields, invalid_numbers as invalid_numbers,
     message_fields as message_fields, shape_error as shape_error, shape_fault as shape_fault,

@@ -31,6 +31,7 @@ from flowrec.core.units import seconds
 Result = TypeVar("Result")
 
 Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.core.declarations import Bools, Floats
 from flowrec.core.system.numba_setup import compiled
 
 LEAST_WEIGHT = 0.25  # of the pixels with a value, for a point to have one
@@ -44,11 +45,11 @@ class Cells:
     column: NDArray[np.intp]  # (...) of the left two
     below: NDArray[np.intp]  # (...) row of the lower two; that of the upper ones in a raster of one row
     right: NDArray[np.intp]  # (...) column of the right two; that of the left ones in a raster of one column
-    a: NDArray[np.float64]  # (...) fraction 0 to 1 along x
-    b: NDArray[np.float64]  # (...) fraction 0 to 1 along y
-    inside: NDArray[np.bool_]  # (...) finite, and at most half a pixel beyond the outermost pixel centres
+    a: Floats  # (...) fraction 0 to 1 along x
+    b: Floats  # (...) fraction 0 to 1 along y
+    inside: Bools  # (...) finite, and at most half a pixel beyond the outermost pixel centres
 
-    def interpolate(self, raster: NDArray[Any]) -> NDArray[np.float64]:
+    def interpolate(self, raster: NDArray[Any]) -> Floats:
         """(..., channels) values of a raster (h, w, channels), or (...) of one (h, w)."""
         fractions = (self.a, self.b) if raster.ndim == 2 else (self.a[..., None], self.b[..., None])
         a, b = fractions
@@ -56,7 +57,7 @@ class Cells:
         lower = (1.0 - a) * _gather(raster, self.below, self.column) + a * _gather(raster, self.below, self.right)
         return np.asarray((1.0 - b) * upper + b * lower, np.float64)
 
-    def interpolate_known(self, raster: NDArray[Any]) -> NDArray[np.float64]:
+    def interpolate_known(self, raster: NDArray[Any]) -> Floats:
         """(...) mean of the finite ones of the four pixels of a raster (h, w), by their weights.
 
         Infinite where the finite ones weigh less than LEAST_WEIGHT and for points that are not inside.
@@ -81,7 +82,7 @@ class Cells:
         return np.stack([self.column, self.right, self.column, self.right], axis=-1)
 
     @property
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> Floats:
         """(..., 4) weights of the pixels 00, 01, 10, 11; their sum is 1."""
         a, b = self.a, self.b
         return np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b], axis=-1)
@@ -94,7 +95,7 @@ def _gather(raster: NDArray[Any], row: NDArray[np.intp], column: NDArray[np.intp
     return np.asarray(raster.reshape(-1, *raster.shape[2:]).take(row * raster.shape[1] + column, 0))
 
 
-def cells_at(points: NDArray[np.float64], shape: tuple[int, ...]) -> Cells:
+def cells_at(points: Floats, shape: tuple[int, ...]) -> Cells:
     """The pixels around points (..., 2) in px, of a raster whose shape begins with (h, w)."""
     h, w = shape[:2]
     x, y = points[..., 0], points[..., 1]
@@ -134,7 +135,7 @@ def nearest_pixel(x: float, y: float, shape: tuple[int, ...]) -> tuple[int, int]
     return min(max(round(y), 0), h - 1), min(max(round(x), 0), w - 1)
 
 
-def nearest_pixels(points: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def nearest_pixels(points: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows (...) and columns (...) of the pixels nearest to finite points (..., 2) in px, as `nearest_pixel`."""
     h, w = shape[:2]
     nearest = np.rint(points).astype(np.intp)

@@ -34,7 +34,6 @@ _UNITS = {
 }
 _WHOLE = ("_bytes", "_ns")
 _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
-_OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
 _ASSIMILATED = "assimilated "  # before the number of observations, at the begin of the note of a refined map
 _UM = re.compile(r"(?<![\w.])um\b")
 _ROBOT = re.compile(r"robot_\d{1,4}")  # keys of the figures of other robots, which are text
@@ -62,14 +61,10 @@ def as_text(figures: Mapping[str, Value]) -> dict[str, str]:
 
 
 def of_text(text: Mapping[str, str]) -> Figures:
-    """Figures from the metadata of a file; sentences of older files stay text.
-
-    `frames_dropped` is the count of the writer, which older files hold under two names; the larger one is complete.
-    """
+    """Figures from the metadata of a file. The writer's count `dropped_frames` is the figure `frames_dropped`."""
     figures = {key: _number(value) if is_numeric(key) else value for key, value in text.items()}
-    counts = [figures.pop("dropped_frames", None), figures.get("frames_dropped")]
-    numbers = [count for count in counts if isinstance(count, int)]
-    return figures | ({"frames_dropped": max(numbers)} if numbers else {})
+    dropped = figures.pop("dropped_frames", None)
+    return figures | ({"frames_dropped": dropped} if isinstance(dropped, int) else {})
 
 
 def doubts_text(doubts: Iterable[str]) -> str:
@@ -166,7 +161,7 @@ def flow_text(figures: Mapping[str, Value]) -> str:
     maps = [
         " ".join(filter(None, (name, text.get(f"{name}_flow_error"), _in_brackets(text.get(f"{name}_method")))))
         for name in ("assumed", "refined")
-        if f"{name}_method" in text or f"{name}_flow_error" in text  # an older file states one without the other
+        if f"{name}_method" in text
     ]
     if not maps:
         return ""
@@ -243,9 +238,6 @@ def is_count(key: str) -> bool:
 
 
 def _number(text: str) -> Value:
-    percent = _OLD_FLOW_ERROR.fullmatch(text)
-    if percent is not None:
-        return float(percent[1]) / 100
     if len(text) > _LONGEST:
         return text
     for kind in (int, float):

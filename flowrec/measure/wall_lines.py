@@ -19,7 +19,7 @@ from flowrec.measure.images import Levels, Mask, blur_image, slopes
 
 _SIGMAS_PX = ((1.2, 2.0), (2.0, 3.5), (3.5, 5.5))  # of lines; each row is a hypothesis
 _THRESHOLDS = (0.55, 0.9)  # of a wall, relative to Otsu's threshold between strong and weak ridges
-_SMOOTH_PX = 1.5
+_SMOOTH_PX = 1.5  # standard deviation of the blur that rounds the border of the basins
 _REACH_PX = 12.0  # within which the ends of walls attract the border of a basin
 
 

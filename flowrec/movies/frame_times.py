@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import DATES, NS_PER_S, TIME_UNITS, MovieError, Table, read_table
+from flowrec.core import DATES, NS_PER_S, TIME_UNITS, Ints, MovieError, Table, read_table
 from flowrec.movies.movie import MovieFacts, whole_ns
 
 _MOST_IMAGES = 1 << 40  # a larger number of an image is no number of an image, and may not fit an integer
@@ -19,9 +18,9 @@ class FrameTimes:
     """Times of the images of one movie, on the clock of the log if that is known."""
 
     text: str  # where the times come from
-    times_ns: NDArray[np.int64] | None = None  # (n,) of the images in order; None: by the rate, or by each image itself
+    times_ns: Ints | None = None  # (n,) of the images in order; None: by the rate, or by each image itself
     # (n,) the camera's numbers of the images, by which gaps are losses; None: they are counted
-    numbers: NDArray[np.int64] | None = None
+    numbers: Ints | None = None
     rate_hz: float | None = None  # None: not by a rate
     exact: bool = False  # `times_ns` has exactly as many rows as there are images
 

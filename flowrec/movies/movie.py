@@ -5,17 +5,17 @@ Nothing is converted silently: grey levels are those of the file, and what had t
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, PIXEL_BITS, Image, Method, Methods, MovieError, pixel_type
+from flowrec.core import NS_PER_S, PIXEL_BITS, Closing, Floats, Image, Ints, Method, Methods, MovieError, pixel_type
 from flowrec.movies.grey import grey_image
 from flowrec.movies.notes import MovieNotes
 
@@ -85,7 +85,7 @@ class MovieFacts:
     bits: int
     frames: int
     counted: bool = True
-    times_ns: NDArray[np.int64] | None = None
+    times_ns: Ints | None = None
     times: str = ""
     um_per_px: float | None = None
     notes: MovieNotes | None = None
@@ -99,7 +99,7 @@ class MovieFacts:
         )
 
 
-class Movie(ABC):
+class Movie(Closing):
     """An open movie. Memory does not grow with its length.
 
     Attributes
@@ -168,12 +168,6 @@ class Movie(ABC):
         affordable = _MEDIAN_BYTES // (facts.width_px * facts.height_px * pixel_type(facts.bits).itemsize)
         count = max(min(count, facts.frames, affordable), 1)
         return np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int)).tolist()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def _grey(self, array: NDArray[Any], index: int) -> Image:
         """Grey levels (h, w) of an image, see `grey_image`."""
@@ -254,12 +248,12 @@ def colours_last(array: NDArray[Any], counts: tuple[int, ...]) -> NDArray[Any]:
     return np.moveaxis(array, 0, 2) if first else array
 
 
-def whole_ns(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+def whole_ns(times_s: Floats) -> Ints:
     """Times in s as ns."""
     return np.rint(np.asarray(times_s, np.float64) * NS_PER_S).astype(np.int64)
 
 
-def nominal_times(count: int, interval_s: float, source: str) -> tuple[NDArray[np.int64], str]:
+def nominal_times(count: int, interval_s: float, source: str) -> tuple[Ints, str]:
     """Times of images at equal intervals, and where they come from."""
     times_ns = whole_ns(np.arange(count, dtype=np.float64) * interval_s)
     return times_ns, f"{source}, every {1e3 * interval_s:.4g} ms; nominal"

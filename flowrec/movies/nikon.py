@@ -10,7 +10,7 @@ import nd2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Image
+from flowrec.core import Floats, Image
 from flowrec.movies.movie import (
     Movie,
     MovieFacts,
@@ -67,7 +67,7 @@ class NikonMovie(Movie):
         return refuse_missing(self._grey(colours_last(array, (1, 3)), index), self.path, index)
 
 
-def _times_s(file: Any, count: int) -> NDArray[np.float64] | None:
+def _times_s(file: Any, count: int) -> Floats | None:
     """Acquisition time of each image since the start of the acquisition; None if one is missing."""
     times = []
     with warnings.catch_warnings(action="ignore"):  # it warns of a file without times

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
+
+from flowrec.core import Floats
 
 # Units by their short names, with both letters for micro, and by their long ones.
 _S_PER = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
@@ -22,7 +23,7 @@ NAMESPACE = "flowrec"  # of the annotation in which flowrec keeps movies/notes.p
 class OmeFacts:
     """None: not stated."""
 
-    times_s: NDArray[np.float64] | None = None  # (n,) DeltaT of each time point
+    times_s: Floats | None = None  # (n,) DeltaT of each time point
     interval_s: float | None = None  # TimeIncrement
     um_per_px: float | None = None
     bits: int | None = None
@@ -79,7 +80,7 @@ def um_per(unit: str | None) -> float | None:
     return _UM_PER.get(unit or "")
 
 
-def _times_s(pixels: ElementTree.Element, frames: int) -> NDArray[np.float64] | None:
+def _times_s(pixels: ElementTree.Element, frames: int) -> Floats | None:
     """DeltaT of the first plane of each time point; of the planes in order where they are numbered by Z."""
     planes = pixels.findall("{*}Plane")
     axis = "TheT" if len({each.get("TheT") for each in planes}) > 1 else "TheZ"

@@ -12,7 +12,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from flowrec.core import Image, MovieError
+from flowrec.core import Image, Ints, MovieError
 from flowrec.movies.grey import refuse_other_type
 from flowrec.movies.movie import (
     Movie,
@@ -152,7 +152,7 @@ def _collect_errors() -> Iterator[list[str]]:
         tifffile.logger().removeHandler(handler)
 
 
-def _times(ome: OmeFacts, imagej: dict[str, Any], count: int) -> tuple[NDArray[np.int64] | None, str]:
+def _times(ome: OmeFacts, imagej: dict[str, Any], count: int) -> tuple[Ints | None, str]:
     """Times of the images, and where they come from."""
     if ome.times_s is not None and (count == 1 or ome.times_s.any()):  # some writers leave all of them 0
         return whole_ns(ome.times_s), "OME DeltaT of each image"

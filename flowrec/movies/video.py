@@ -17,7 +17,7 @@ import av.logging
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import MCAP, NS_PER_S, Image, MovieError, pixel_type
+from flowrec.core import MCAP, NS_PER_S, Image, Ints, MovieError, pixel_type
 from flowrec.movies.grey import CHANNELS, refuse_colour
 from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, checked_size
 from flowrec.movies.notes import notes_in, refuse_drawn
@@ -121,7 +121,7 @@ class VideoMovie(Movie):
             self.broken_off(len(pts), f"breaks off after {len(pts)} images ({_text(error)})", error)
         return pts, damaged
 
-    def _header_frames(self, times: NDArray[np.int64] | None) -> int:
+    def _header_frames(self, times: Ints | None) -> int:
         """Number of images that the header states; 0 if it states none."""
         if self._stream.frames:
             return int(self._stream.frames)
@@ -141,7 +141,7 @@ class VideoMovie(Movie):
         if streams > 1:
             self._assumed.append(f"it has {streams} video streams; the best one is read")
 
-    def _times(self, *, all_timed: bool) -> tuple[NDArray[np.int64] | None, str]:
+    def _times(self, *, all_timed: bool) -> tuple[Ints | None, str]:
         """Times of the images, and where they come from."""
         rate = self._stream.average_rate or self._stream.guessed_rate
         nominal = self._container.format.name in _NOMINAL

@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 LONGEST_TEXT = 500  # characters of an event; what is longer is cut
 RAMP_PATIENCE_S = 0.8  # time for the coils to ramp down by ticks; the next tick then takes all of the field away
 _TICK_PATIENCE_S = 0.3  # time for that tick to come; then the loop is interrupted, and the rig switches the coils off
-_SWALLOWED_S = 0.5  # for work to let `Interrupted` through; then it has swallowed it
+_SWALLOWED_S = 0.5  # for work to end after `Interrupted`; then it has swallowed it
 _STUCK_S = 5.0  # time for the loop to be interrupted; then its thread is stuck
 
 _MOST_WAITING = 100  # events; each takes a tick, so more would be recorded seconds after they were asked for
@@ -213,7 +213,7 @@ class RunControl:
             raise Interrupted
 
     def interrupt_again(self) -> None:
-        """In the loop's thread, of an `Interrupted` that Python could not raise (the end of an object, a callback)."""
+        """In the loop's thread: allow another `Interrupted` after one that Python has swallowed, in a finalizer say."""
         self._at_work = self._working
 
     def unless_stopped(self, work: Callable[[], Result], otherwise: Result) -> Result:

@@ -23,7 +23,7 @@ FreeBytes = Callable[[Path], int]
 
 
 def free_bytes(folder: Path) -> int:
-    """Bytes that may still be written there."""
+    """Bytes that can still be written to a folder."""
     return shutil.disk_usage(folder).free
 
 
@@ -41,7 +41,7 @@ def refuse_below(floor_gb: float, folder: Path, free: FreeBytes = free_bytes) ->
 
 
 class DiskMonitor:
-    """Takes the free space every second where a session is written.
+    """Measures every second the free space of the disk that a session is written to.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class DiskMonitor:
             pass
 
     def sample(self) -> bool:
-        """Take the free space once; whether it is below the floor."""
+        """Measure the free space once; True if it is below the floor."""
         try:
             self._left = self._free(self._folder)
         except OSError:

@@ -2,8 +2,8 @@
 
 Samples come from the pages of consoles, in their threads; the loop takes the latest one at each tick. Steering ends
 when the button is released, the page is closed, or no sample has come for `SILENCE_S`. Then the field is taken away at
-once, before any tick (`Watchdog.rest`), and the next tick records why. What has ended goes on with another press of the
-button only, so a page that was frozen does not steer again by itself. One page steers at a time.
+once, before any tick (`Watchdog.rest`), and the next tick records why. After that only another press of the button
+steers, so a page that was frozen does not steer again by itself. One page steers at a time.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 
 from flowrec.core import Floats, Hand
 
-# Pages send 50 samples a second: seven in a row are missing, which a busy browser or a tunnel delays by less. A robot
-# at 0.5 mm/s is then 75 um farther on.
+# Pages send 50 samples a second: of seven in a row none has come, more than a busy browser or a tunnel delays. A robot
+# at 0.5 mm/s moves 75 um in this time.
 SILENCE_S = 0.15
 DEVICES = ("gamepad", "keys")
 _LONGEST = 1.0 + 1e-6  # of the share

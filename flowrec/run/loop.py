@@ -285,7 +285,7 @@ def _end(report: RunReport, sinks: Sequence[Sink], control: RunControl, watchdog
     elif control.reason:  # no tick has recorded it
         report.outcome, report.note = Outcome.STOPPED, control.reason
     if field_was_on:
-        report.note += "; the coils were switched off before they were down their ramp"
+        report.note += "; the coils were switched off before they had ramped down"
     if watchdog.hung:
         report.outcome, report.note = Outcome.FAILED, watchdog.reason
     if watchdog.failures:

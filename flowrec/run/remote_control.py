@@ -1,6 +1,6 @@
 """A run is steered from another process of the same user: its commands come through a local socket.
 
-A console can so be opened onto a run under way, whatever its start said. The socket lies in a folder of temporary files
+So a console can be opened for a run that was started without one. The socket lies in a folder of temporary files
 that only the user can enter, under a name that follows from the session's path; on Windows it is a named pipe. A
 connection carries one command, as JSON, and its answer.
 """
@@ -22,7 +22,7 @@ from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import obey
 
 _LONGEST_BYTES = 4096  # of a command, and of its answer
-_PATIENCE_S = 1.0  # for the words of a connection; then it is closed
+_PATIENCE_S = 1.0  # for a connection to send its command; then it is closed
 _ANSWER_S = 5.0  # for the run's answer: it takes a command between two ticks
 _PAUSE_S = 0.1
 _BACKLOG = 16  # connections that wait to be accepted

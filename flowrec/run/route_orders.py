@@ -1,4 +1,4 @@
-"""Work orders for routes: what a survey and a plan are given, of what was known in the tick of the order."""
+"""Work orders for routes: the inputs of a survey and of a plan, from what was known in the tick of the order."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
 
 
 def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
-    """The way to the goal; on the way there the present one, unless another is better or the goal a new one."""
+    """The route to the goal; under way the present one, unless another is better or the goal is new."""
     field = order.field
     assert field is not None
     robot, planner = robot_at(order, mission, pipeline.robot), pipeline.planner

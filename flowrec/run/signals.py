@@ -92,12 +92,12 @@ class Signals:
             stack.callback(os.close, reading)
             stack.callback(os.close, writing)
             stack.callback(self._take_late, reading)
-            # The pipe outlasts the handlers: a signal that no handler of before sees is in it.
+            # The pipe outlasts the handlers: it holds a signal that the former handlers do not see.
             stack.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(-1))
             signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
             handlers = dict.fromkeys(wanted, _leave_to_pipe) | {signal.SIGALRM: self._interrupt}
             for number, handler in handlers.items():
-                # The way back first: a signal may raise between any two of these lines.
+                # Restoring is registered first: a signal may raise between any two of these lines.
                 stack.callback(signal.signal, number, signal.getsignal(number))
                 signal.signal(number, handler)
             stack.callback(setattr, sys, "unraisablehook", sys.unraisablehook)
@@ -112,7 +112,7 @@ class Signals:
                 thread.join()  # it may have to stop the process
 
     def _take_late(self, pipe: int) -> None:
-        """The signals that came after the thread had ended: they end what follows the run."""
+        """Handle the signals that came after the thread had ended: they end what follows the run."""
         with suppress(BlockingIOError):
             for number in os.read(pipe, 64):
                 if number in _ENDING:
@@ -122,7 +122,7 @@ class Signals:
         self._control.interrupt()
 
     def _take_swallowed(self, before: Callable[[Any], object], found: Any) -> None:
-        """Hook of exceptions that Python can not raise; of an interruption the thread sends another one."""
+        """Hook for exceptions that Python can not raise: after an `Interrupted` the thread sends another signal."""
         if isinstance(found.exc_value, Interrupted):
             self._control.interrupt_again()
         else:

@@ -50,7 +50,7 @@ _STATED_NS = NS_PER_S  # from one message with the state of the streams to the n
 
 @dataclass(slots=True)
 class _Known:
-    """A reader, and what the run has of it."""
+    """A reader, and what the run knows of its stream."""
 
     reader: StreamReader
     places: list[int]  # of its channels in the list of all

@@ -25,7 +25,7 @@ from flowrec.rigs import Chunk, NoStreamError, SampleStream, StreamHead
 from flowrec.stages import StreamSettings
 
 _SLICE_S = 0.02  # longest wait for samples
-_GATHER_S = 0.01  # samples that come within this time are taken together, so that few turns are taken from the loop
+_GATHER_S = 0.01  # samples that come within this time are handled together, so that the loop is seldom interrupted
 _DRAIN_S = 0.2  # longest time for samples from before the run to be thrown away
 _AGAIN_S = 0.5  # between two looks for a sender that has ended
 _JOIN_S = 1.5

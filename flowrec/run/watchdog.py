@@ -25,8 +25,8 @@ from flowrec.core import Currents, Priority, RigError, realtime_priority
 from flowrec.rigs import Resting, Rig
 
 ZERO_PATIENCE_S = 2.0  # time for zero() to succeed, with all its repetitions; then the run fails
-_RETRY_S = 0.02
-_POLL_S = 0.002
+_RETRY_S = 0.02  # between two tries of zero() that fail
+_POLL_S = 0.002  # of who waits for zero()
 _IDLE_S = 0.5  # between checks without a timer
 
 
@@ -100,7 +100,7 @@ class Watchdog:
             self.apply(currents)
 
     def go_on(self) -> None:
-        """Let the commands from now on pass again: the loop has taken in why the field was to rest."""
+        """Let commands pass again: the loop knows why the field was taken away."""
         self._resting = False
 
     def tick_ended(self) -> None:

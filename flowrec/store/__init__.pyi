@@ -4,9 +4,9 @@ from .bucket_upload import (
 )
 from .byte_source import is_there as is_there, open_bytes as open_bytes, size_of as size_of
 from .channels import FRAME_PATH as FRAME_PATH, SLOTS as SLOTS, is_left_out as is_left_out
-from .gathered_copies import is_copy as is_copy
 from .growing_run import GrowingRun as GrowingRun, live_runs as live_runs
-from .mcap_reader import ForeignError as ForeignError
+from .lookup import is_copy as is_copy
+from .mcap_format import ForeignError as ForeignError
 from .notes import NOTES_SUFFIX as NOTES_SUFFIX, Note as Note, notes_content as notes_content, notes_file as notes_file
 from .reader import SessionReader as SessionReader
 from .recovery import Recovered as Recovered, recover as recover, recover_run as recover_run

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -14,9 +13,9 @@ from mcap.records import ChunkIndex, Metadata
 from flowrec.core import FIXED, Message, SessionError, TopicTable, printable, seconds
 from flowrec.store.channels import SessionContents
 from flowrec.store.digest import HEAD, channel_digest, head_digest, sum_text, topic_text
-from flowrec.store.gathered_copies import GatheredCopies
-from flowrec.store.mcap_format import Record
-from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
+from flowrec.store.lookup import GatheredCopies
+from flowrec.store.mcap_format import DamageError, Record, UnfinishedError
+from flowrec.store.mcap_reader import McapReader
 from flowrec.store.roi import Region
 from flowrec.store.run_files import RunFile, files_of
 from flowrec.store.scan import Scan, scan
@@ -109,7 +108,7 @@ def audit(
         contents = SessionContents(path)
     except (UnfinishedError, DamageError) as error:
         why_not = _without_advice(error, path)
-        with contextlib.closing(McapReader(path)) as source:
+        with McapReader(path) as source:
             contents = SessionContents(path, scan(source).summary)
     with contents:
         found = Audit(path, contents.source.size, not why_not, why_not, contents.flowrec_version)

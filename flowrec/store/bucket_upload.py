@@ -13,13 +13,13 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flowrec.core import SessionError, UsageError
+from flowrec.core import Closing, SessionError, UsageError
 from flowrec.store.object_requests import NOT_OFFERED, in_a_line, of_status, reason
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import MissingError, RefusedError, TransientError, ask_repeatedly, timeout_s
@@ -57,7 +57,7 @@ class Sent:
     etag: str  # that the store gave to the object
 
 
-class LocalParts:
+class LocalParts(Closing):
     """A file, in the parts in which it is sent.
 
     `content`: of the file, once `read_all` has come to its end. Raises SessionError: it can not be read, or changes
@@ -112,7 +112,7 @@ class LocalParts:
 
 def content_of_file(path: Path, progress: Callable[[int], None] = lambda _: None) -> Content:
     """Size and hashes of a file; `progress` takes the bytes that have been read. SessionError if it can not be read."""
-    with closing(LocalParts(path)) as parts:
+    with LocalParts(path) as parts:
         for number, _, _ in parts.read_all():
             progress(min(number * parts.part_bytes, parts.size))
         return parts.content
@@ -155,7 +155,7 @@ class Bucket:
         `progress`: takes the bytes of the file that the bucket has.
         """
         name = path.name
-        with closing(LocalParts(path)) as parts:
+        with LocalParts(path) as parts:
             if parts.count > 1:
                 return _Upload(partial(self._ask, name), self._key(name), parts).run(progress)
             ((_, data, _),) = parts.read_all()

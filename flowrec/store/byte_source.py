@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import threading
@@ -11,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flowrec.core import SessionError, refuse_irregular
+from flowrec.core import Closing, SessionError, refuse_irregular
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import MissingError
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from flowrec.store.remote_file import RemoteFile
 
 
-class LocalFile:
+class LocalFile(Closing):
     """A file on this machine, whose bytes are read by range, from several threads at a time; see RemoteFile, too.
 
     Raises SessionError: it can not be opened.
@@ -108,5 +107,5 @@ def is_there(path: Path) -> bool:
 
 def size_of(path: Path) -> int:
     """Number of bytes of a file; errors as of `open_bytes`."""
-    with contextlib.closing(open_bytes(path)) as source:
+    with open_bytes(path) as source:
         return source.size

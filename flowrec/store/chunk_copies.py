@@ -14,22 +14,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
-from numpy.typing import NDArray
 
-from flowrec.core import BY_PATH, Applied, Message, Outcome, SessionError, Timing, seconds
+from flowrec.core import BY_PATH, Applied, Ints, Message, Outcome, SessionError, Timing, seconds
 from flowrec.store.channels import SLOTS, VIEWED, SessionContents
 from flowrec.store.chunk import ChunkBuilder, MessageIndexes
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.gathered_copies import is_copy
+from flowrec.store.lookup import is_copy
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, Record, SealedChunk, records_in
 from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.older_files import FORMER_RECORDS
 from flowrec.store.scan import Scan
 from flowrec.store.session_metadata import DIGEST, OUTCOME
 from flowrec.store.write_queue import Counters
 
 _MESSAGE_BYTES = RECORD_HEAD.size + MESSAGE_HEAD.size  # of a record besides its payload
-_ANEW = (OUTCOME, DIGEST, "flowrec.view")  # records of which the new file gets its own; the last is of older files
-_COUNTED = ("ticks", "dropped_frames", "frames_dropped")  # the last one in older files
+_ANEW = FORMER_RECORDS | {OUTCOME, DIGEST}  # records of which the new file gets its own, or none
+_COUNTED = ("ticks", "dropped_frames")
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ class RecoveryTally:
         return {**recorded, **marks, "outcome": Outcome.CUT, "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
 
 
-def _array(times: array[int]) -> NDArray[np.int64]:
+def _array(times: array[int]) -> Ints:
     return np.frombuffer(times, np.int64) if times else np.zeros(0, np.int64)
 
 

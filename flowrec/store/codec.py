@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from flowrec.core import (
     NS_PER_S,
     Event,
+    Floats,
     Frame,
     Level,
     MessageField,
@@ -257,7 +258,7 @@ def _unpacker(form: MessageField, vector_of: Callable[[Any], Any]) -> Callable[[
     return lambda parsed: present(parsed) if parsed.HasField(name) else None
 
 
-def _vector(values: Any) -> NDArray[np.float64]:
+def _vector(values: Any) -> Floats:
     return np.fromiter(values, np.float64, len(values))
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from flowrec.core import NS_PER_S, SessionError, Tick, is_growing
 from flowrec.store.file_reader import FileReader
@@ -21,10 +21,6 @@ from flowrec.store.recorder_process import MODULE
 from flowrec.store.run_files import PARTIAL_SUFFIX, part_number, part_path, partial_path, run_files, run_path
 from flowrec.store.scan import Scan, extent_of
 from flowrec.store.session_metadata import SessionHeader
-
-if TYPE_CHECKING:
-    from flowrec.physics import Chip
-    from flowrec.stages import ResolvedConfig
 
 _IMAGE_LATE_NS = 2 * NS_PER_S  # longer than this a tick does not wait for its image
 _POLL_S = 0.1
@@ -75,16 +71,6 @@ class GrowingRun:
         """Configuration, chip and provenance."""
         with self._file.reader() as reader:
             return reader.header
-
-    @cached_property
-    def config(self) -> ResolvedConfig:
-        """The configuration of the run."""
-        return self.header.config(f"{self.path}: config.toml inside")
-
-    @cached_property
-    def chip(self) -> Chip:
-        """The chip."""
-        return self.header.chip()
 
     @property
     def outcome(self) -> Mapping[str, str]:

@@ -1,4 +1,4 @@
-"""The MCAP format: magic, record layouts, the limits within which flowrec reads, and the summary of a file.
+"""The MCAP format: magic, record layouts, limits and errors of reading, and the summary of a file.
 
 mcap's own records take some 20 us each to parse; a session of hours has ten thousands of chunks and must open at once.
 Layout: https://mcap.dev/spec.
@@ -11,11 +11,17 @@ import io
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import zstandard
+from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
+
+from flowrec.core import SessionError
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -37,6 +43,37 @@ MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
 # Of schemas, channels, metadata and attachments together, each of which takes some 20 us. flowrec writes 60.
 DECLARED_LIMIT = 10_000
 _DECLARATIONS_KEPT = 1024  # in memory: most sessions of a folder have the same ones
+
+
+# What the libraries raise on damaged bytes, as found by reading thousands of mutated files.
+DAMAGE = (
+    McapError,
+    DecodeError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    KeyError,
+    TypeError,
+    IndexError,
+    OverflowError,
+    MemoryError,
+)
+
+
+class ForeignError(SessionError):
+    """A file that flowrec has not written, MCAP or not."""
+
+
+class UnfinishedError(SessionError):
+    """The end of the file is missing: the run was killed, is still going on, or the file is cut off."""
+
+
+class DamageError(SessionError):
+    """Bytes that can not be parsed; `what` says where and why, without advice."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        super().__init__(f"{path}: {what}; `flowrec recover {path}` recovers what is intact")
+        self.what = what
 
 
 class Record(NamedTuple):

@@ -7,15 +7,12 @@ errors of several libraries escape. Here every size is checked before it is used
 from __future__ import annotations
 
 import contextlib
-import struct
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, cast
 
 import zstandard
-from google.protobuf.message import DecodeError
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -30,23 +27,26 @@ from mcap.records import (
     Schema,
 )
 
-from flowrec.core import MOVIE_FILES, SessionError
+from flowrec.core import MOVIE_FILES, Closing
 from flowrec.store.byte_source import open_bytes
-from flowrec.store.gathered_copies import GatheredCopies, complement
-from flowrec.store.lookup_record import Piece, parse_lookup, place_of_lookup
+from flowrec.store.lookup import GatheredCopies, Piece, complement, parse_lookup, place_of_lookup
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
     CHUNK_HEAD,
     CHUNK_LIMIT_BYTES,
     CRC,
+    DAMAGE,
     FOOTER_BYTES,
     LONG,
     MAGIC,
     MESSAGE_HEAD,
     MESSAGES_LIMIT,
     RECORD_HEAD,
+    DamageError,
+    ForeignError,
     Record,
     Summary,
+    UnfinishedError,
     parse_summary,
     records_in,
     stream_of,
@@ -64,21 +64,6 @@ _SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
 _PARSED: dict[Opcode, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 _LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: 256 << 20}
 
-# What the libraries raise on damaged bytes, as found by reading thousands of mutated files.
-_DAMAGE = (
-    McapError,
-    DecodeError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    KeyError,
-    TypeError,
-    IndexError,
-    OverflowError,
-    MemoryError,
-)
-
-
 # Programs that read what is taken for a session, by suffix; else flowrec has no use for it.
 _READ_BY = {
     **dict.fromkeys(MOVIE_FILES, "flowrec import makes a session of a movie"),
@@ -88,23 +73,7 @@ _READ_BY = {
 }
 
 
-class ForeignError(SessionError):
-    """A file that flowrec has not written, MCAP or not."""
-
-
-class UnfinishedError(SessionError):
-    """The end of the file is missing: the run was killed, is still going on, or the file is cut off."""
-
-
-class DamageError(SessionError):
-    """Bytes that can not be parsed; `what` says where and why, without advice."""
-
-    def __init__(self, path: Path, what: str) -> None:
-        super().__init__(f"{path}: {what}; `flowrec recover {path}` recovers what is intact")
-        self.what = what
-
-
-class McapReader:
+class McapReader(Closing):
     """An MCAP file. Reads are independent of each other and may come from several threads.
 
     `start_unix_ns`: Unix time of stamp 0 of the session, as soon as it has been read; log times are reduced by it.
@@ -112,10 +81,9 @@ class McapReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.start_unix_ns = 0
+        self.path, self.start_unix_ns = path, 0
         self._bytes = open_bytes(path)
-        self.size, self.close = self._bytes.size, self._bytes.close
+        self.size = self._bytes.size
         self._summary: Summary | None = None  # that was read to find the copies
         self._pieces: list[Piece] = []
         self._copies: GatheredCopies | None = None
@@ -126,6 +94,10 @@ class McapReader:
         except BaseException:
             self.close()
             raise
+
+    def close(self) -> None:
+        """Release the bytes."""
+        self._bytes.close()
 
     def set_start(self, unix_ns: int) -> None:
         """Set `start_unix_ns`. Raises ValueError: it is no time."""
@@ -187,7 +159,7 @@ class McapReader:
         """Turns any error that a library raises on damaged bytes into a SessionError."""
         try:
             yield
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise self.damage_error(offset, str(error) or type(error).__name__) from error
 
     def read_summary(self) -> Summary:

@@ -33,15 +33,15 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from flowrec.core import SessionError, open_new
+from flowrec.core import Closing, SessionError, open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
-from flowrec.store.lookup_record import LOOKUP_OPCODE, SMALL_BYTES, Piece, lookup_record
+from flowrec.store.lookup import LOOKUP_OPCODE, SMALL_BYTES, Piece, lookup_record
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary, parse_summary
 
 _BUFFERS_PER_WRITE = 1024  # IOV_MAX of Linux
 
 
-class McapWriter:
+class McapWriter(Closing):
     """An MCAP file open for appending. When a method returns, the operating system has the bytes.
 
     It is locked until it is closed, so that no other process writes it or takes it for the rest of a killed run. Raises

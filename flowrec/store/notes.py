@@ -6,7 +6,6 @@ notes that lie beside another file are not its notes.
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -74,7 +73,7 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
 def notes_content(path: Path) -> bytes:
     """The bytes of a file of notes; none where there is no file. SessionError if it can not be read."""
     try:
-        with contextlib.closing(open_bytes(path)) as source:
+        with open_bytes(path) as source:
             return source.read(0, min(source.size, _FILE_LIMIT))
     # Also where access to a URL is refused: S3 does not tell who may not list a bucket what is not there.
     except MissingError:

@@ -8,13 +8,12 @@ import itertools
 import operator
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import COILS, Frame, SessionError, Tick, array_shapes, seconds
+from flowrec.core import COILS, Closing, Frame, Ints, SessionError, Tick, array_shapes, seconds
 from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.run_files import Run
@@ -24,7 +23,7 @@ from flowrec.store.session_path import session_path
 _OPEN_FILES = 4
 
 
-class SessionReader:
+class SessionReader(Closing):
     """A finished session, open for reading; several iterations may run at a time.
 
     X.mcap is that file or, where there is none, the run whose parts are X.part001.mcap and so on; a part or a snapshot
@@ -229,14 +228,6 @@ class SessionReader:
         for file in self._open.values():
             file.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _files_with(self, fields: set[str]) -> Iterator[tuple[FileReader, int]]:
         """The files with messages of some topics, each with the stamp of its keyframe, which is skipped; else -1."""
         for number, file in enumerate(self._run.files):
@@ -276,7 +267,7 @@ class Frames(Sequence[Frame]):
         self._which = which if which is not None else range(reader.frame_count)
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> Ints:
         return np.array(self._reader.frame_stamps, np.int64)[list(self._which)]
 
     @property

@@ -7,8 +7,6 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mcap.records import Metadata
-
 from flowrec.core import (
     MCAP,
     FlowrecError,
@@ -21,10 +19,11 @@ from flowrec.core import (
     refuse_irregular,
 )
 from flowrec.store.audit import disagreements, edits_of
-from flowrec.store.channels import SessionContents, left_out
+from flowrec.store.channels import VIEWED, SessionContents, left_out
 from flowrec.store.chunk_copies import ChunkCopier, Losses, RecoveryTally
-from flowrec.store.gathered_copies import gather
-from flowrec.store.mcap_reader import DamageError, McapReader
+from flowrec.store.file_end import end_file
+from flowrec.store.mcap_format import DamageError
+from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import disk_errors, new_mcap
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import (
@@ -38,9 +37,8 @@ from flowrec.store.run_files import (
 )
 from flowrec.store.scan import Scan, scan
 from flowrec.store.session_file import WriterOptions
-from flowrec.store.session_metadata import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, OUTCOME, PROVENANCE, SESSION, Part
+from flowrec.store.session_metadata import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION, Part
 from flowrec.store.session_path import on_this_machine
-from flowrec.store.viewer_pass import draw
 from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.writer import SessionWriter
 
@@ -166,7 +164,7 @@ def _recover(path: Path, out: Path | None) -> Recovered:
         _refuse_if_taken(target)
         _rename(path, target)
         return Recovered(target, intact.ticks, intact.duration_s)
-    with contextlib.closing(McapReader(path)) as source:
+    with McapReader(path) as source:
         declared = scan(source, heads_only=True)
     if partial and not declared.chunks_passed:
         raise _nothing_on_disk(path)
@@ -199,7 +197,7 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
     """Copy everything intact of a file into a new one, and complete that."""
     path = contents.source.path
     tally = RecoveryTally(contents)
-    with contextlib.closing(new_mcap(draft, overwrite=True)) as out, disk_errors(draft):
+    with new_mcap(draft, overwrite=True) as out, disk_errors(draft):
         copier = ChunkCopier(contents, out, tally)
         found = scan(contents.source, copier.visit)
         if not found.summary.chunks and path.name.endswith(PARTIAL_SUFFIX):
@@ -210,15 +208,9 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
                 f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; "
                 "remove the file"
             )
-        out.add(Metadata(OUTCOME, kept.outcome))
-        if copier.draws:
-            camera, start_unix_ns = ChipCamera.of(contents.header), contents.source.start_unix_ns
-            draw(draft, out, camera, start_unix_ns, _left_out(contents), kept.outcome)
-        for copies in gather(draft, out.summary(), contents.source.start_unix_ns):
-            out.add(copies)
-        out.add_digest()
-        out.finish()
-        out.sync()
+        unwanted = _left_out(contents) if copier.draws else VIEWED
+        start_unix_ns = contents.source.start_unix_ns
+        end_file(draft, out, kept.outcome, ChipCamera.of(contents.header), start_unix_ns, unwanted)
     return kept
 
 

@@ -1,6 +1,6 @@
 """Sessions at URLs as sources of bytes, with few requests, many at a time; and the objects of folders in buckets.
 
-Opening asks for the last 512 KiB, which hold the index of most sessions and a copy of their head (gathered_copies.py);
+Opening asks for the last 512 KiB, which hold the index of most sessions and a copy of their head (lookup.py);
 files without copies are asked for the first 256 KiB, too. Both, and the rest of a longer index, are remembered for a
 while, because a session is opened several times in a row. What `prefetch` announces is fetched at once, a bounded
 number of bytes ahead; ranges near each other are one request. Each answer must be of the object that was
@@ -20,7 +20,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flowrec.core import SessionError
+from flowrec.core import Closing, SessionError
 from flowrec.store.object_requests import CONNECTIONS, Answer, ListedObject, ObjectRequests, listing, requests_for
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout_s
@@ -63,7 +63,7 @@ _remembered: OrderedDict[str, _Opened] = OrderedDict()
 _remembering = threading.Lock()
 
 
-class RemoteFile:
+class RemoteFile(Closing):
     """An object at a URL, whose bytes are read as those of a LocalFile.
 
     Attributes

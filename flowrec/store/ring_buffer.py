@@ -13,14 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from flowrec.core import Action, Drops, Event, Level, OperatorEvent, Outcome, nanoseconds, seconds
-from flowrec.store.channels import FRAMES
-from flowrec.store.chunk import ChunkEncoder, Sink, copy_chunks
-from flowrec.store.mcap_format import SealedChunk
+from flowrec.store.chunk import ChunkEncoder
 from flowrec.store.run_files import partial_path, snapshot_path
 from flowrec.store.segments import RecordingPlan, Segment, SegmentedRun
 from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
-from flowrec.store.write_queue import Counters, EncodedMessages, Entry, NewMessages
+from flowrec.store.write_queue import Counters, Entry, NewMessages
 
 _SEGMENT_S, _SEGMENTS = 1.0, 8  # length of a segment in s, at most this fraction of the ring
 _EVENTS_LISTED = 20  # of one snapshot
@@ -34,66 +32,19 @@ class _SnapshotFile(SessionFile):
     until_ns : stamp after which it ends.
     events : in it, as text.
     outcome : for its end; before that, what is said of a ring that was too small.
-    first, last : segments in it; `last` is None until it ends.
+    last : segment in it; None until it ends.
     """
 
-    def __init__(
-        self, path: Path, header: SessionHeader, options: WriterOptions, limit_bytes: int, first: _RingSegment
-    ) -> None:
+    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, limit_bytes: int) -> None:
         super().__init__(path, header, options, limit_bytes=limit_bytes)
         self.until_ns = 0
         self.events: list[str] = []
-        self.first = first
-        self.last: _RingSegment | None = None
+        self.last: Segment | None = None
         self.outcome: dict[str, str] = {}
         self.counters = Counters()
 
 
-class _RingSegment(Segment):
-    """Consecutive ticks: in memory, or written to a snapshot."""
-
-    file: _SnapshotFile | None
-
-    def __init__(self, encoder: ChunkEncoder, state: EncodedMessages, keyframe_ns: int | None) -> None:
-        super().__init__(encoder, keyframe_ns)
-        self.state = state  # at the keyframe
-        self.sequences = Counter(encoder.sequences)
-        self.image: list[SealedChunk] = []  # the last one before it
-        self.chunks: list[SealedChunk] = []
-        self.discarded = False  # too old before all of its images had come
-        encoder.sink = self._keep(self.chunks)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of its chunks in memory."""
-        return sum(len(chunk.data) for chunks in (self.chunks, self.image) for chunk in chunks)
-
-    def add(self, entry: Entry) -> None:
-        if not self.discarded:
-            super().add(entry)
-
-    def add_keyframe_image(self, entry: Entry) -> None:
-        if self.file is not None and self.file.first is not self:
-            return  # the segment before it is in the same file
-        sink = self.encoder.sink
-        self.encoder.sink = self._keep(self.image) if self.file is None else self.file.put
-        self.encoder.add(entry)
-        self.encoder.seal((FRAMES,))
-        self.encoder.sink = sink
-
-    def write_to(self, snapshot: _SnapshotFile) -> None:
-        """Write the chunks in memory, and later entries, to a file."""
-        self.file = snapshot
-        snapshot.put(self.chunks)
-        self.chunks, self.image, self.state = [], [], {}
-        self.encoder.sink = snapshot.put
-
-    @staticmethod
-    def _keep(chunks: list[SealedChunk]) -> Sink:
-        return lambda sealed: chunks.extend(copy_chunks(sealed))
-
-
-class RingBuffer(SegmentedRun[_RingSegment]):
+class RingBuffer(SegmentedRun):
     """Keeps the last seconds of the entries, and writes files around events."""
 
     def __init__(self, plan: RecordingPlan, tell: Callable[[str], None]) -> None:
@@ -106,7 +57,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         self._number = 0
         self._sequences: Counter[str] = Counter()
         self._free: list[ChunkEncoder] = []
-        self._ring: deque[_RingSegment] = deque()  # without those that still wait for images
+        self._ring: deque[Segment] = deque()  # without those that still wait for images
         self._is_short = False  # the ring has been too small since it began to fill
         self._snapshot: _SnapshotFile | None = None
         self.open.append(self._segment())
@@ -124,16 +75,16 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         return self._last_ns  # a run in memory never waits for the disk
 
     def add(self, entry: Entry) -> None:
-        self._collect_finished()
-        if entry.ticks:
-            snapshot = self._snapshot
-            if snapshot is not None and entry.stamp_ns > snapshot.until_ns:
-                self._end_snapshot({"outcome": Outcome.SNAPSHOT, "note": snapshot.events[0]})
-            elif snapshot is None and self._is_full(entry.stamp_ns):
-                self._cut(self._segment())
-        self._route(entry)
+        super().add(entry)
         if entry.event:
             self._take(entry.event, entry.stamp_ns)
+
+    def _cut_before(self, stamp_ns: int) -> None:
+        snapshot = self._snapshot
+        if snapshot is not None and stamp_ns > snapshot.until_ns:
+            self._end_snapshot({"outcome": Outcome.SNAPSHOT, "note": snapshot.events[0]})
+        elif snapshot is None and self._is_full(stamp_ns):
+            self._cut(self._segment())
 
     def flush(self) -> None:
         pass  # see flushed_ns
@@ -146,11 +97,11 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             self._end_snapshot(outcome)
         self._collect_finished(wait=True)
 
-    def _end(self, segment: _RingSegment) -> None:
+    def _end(self, segment: Segment) -> None:
         """Add a complete segment to the ring or to its snapshot."""
         snapshot = segment.file
         segment.encoder.seal()
-        if snapshot is not None:
+        if isinstance(snapshot, _SnapshotFile):
             snapshot.encoders.remove(segment.encoder)
             snapshot.counters.include(segment.counters)
             if snapshot.last is segment:
@@ -160,13 +111,10 @@ class RingBuffer(SegmentedRun[_RingSegment]):
             self._trim()
         self._free.append(segment.encoder)
 
-    def _segment(self) -> _RingSegment:
-        if self._free:
-            encoder = self._free.pop()
-        else:
-            encoder = self._encoder(lambda _chunks: None)  # until a segment uses it
-            encoder.sequences = self._sequences
-        return _RingSegment(encoder, dict(self._state), self._last_ns)
+    def _segment(self) -> Segment:
+        encoder = self._free.pop() if self._free else self._encoder()
+        encoder.sequences = self._sequences
+        return Segment(encoder, self._state_now())
 
     def _note_finished(self, file: SessionFile) -> None:
         super()._note_finished(file)
@@ -176,13 +124,13 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         segment = self.open[-1]
         if segment.begin_ns is None:
             return False
-        return stamp_ns - segment.begin_ns >= self._segment_ns or _SEGMENTS * segment.nbytes >= self._limit_bytes
+        return stamp_ns - segment.begin_ns >= self._segment_ns or _SEGMENTS * segment.held_bytes >= self._limit_bytes
 
-    def _segments(self) -> list[_RingSegment]:
+    def _segments(self) -> list[Segment]:
         """The segments in memory, oldest first."""
         return [*self._ring, *(each for each in self.open if each.file is None and not each.discarded)]
 
-    def _is_old(self, segment: _RingSegment) -> bool:
+    def _is_old(self, segment: Segment) -> bool:
         """True if the ring is long enough without the segments before this one."""
         begin_ns, last_ns = segment.begin_ns, self._last_ns
         return last_ns is not None and begin_ns is not None and last_ns - begin_ns >= self._before_ns
@@ -193,7 +141,7 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         while self._ring:
             segments = self._segments()
             begin_ns, old = segments[1].begin_ns, self._is_old(segments[1])
-            large = sum(segment.nbytes for segment in segments) > self._limit_bytes
+            large = sum(segment.held_bytes for segment in segments) > self._limit_bytes
             if not old and not large:
                 return
             if not old and not self._is_short:
@@ -222,21 +170,15 @@ class RingBuffer(SegmentedRun[_RingSegment]):
         self._number += 1
         header = replace(self._header, part=Part(self._plan.run, self._number, "snapshot", first.keyframe_ns, event))
         path = snapshot_path(self._path, self._number)
-        self._snapshot = snapshot = _SnapshotFile(path, header, self._options, self._limit_bytes, first)
-        self._unfinished.append(snapshot)
+        self._snapshot = snapshot = _SnapshotFile(path, header, self._options, self._limit_bytes)
+        self._begin_file(snapshot, first)
         if self._is_short:
             short = f"{held_s:.1f} of {self._settings.before_s:g} s before the event"
             snapshot.outcome = {"short_of_memory": short}
-        if first.keyframe_ns is not None:
-            encoder = self._encoder(snapshot.put)
-            # Numbered as if they had been written just before what follows.
-            encoder.sequences = Counter({topic: (number - 1) % 2**32 for topic, number in first.sequences.items()})
-            snapshot.write_keyframe(encoder, Entry(first.keyframe_ns, first.state, 0))
-            snapshot.put(first.image)
         for segment in self._ring:
             snapshot.counters.include(segment.counters)
         for segment in segments:
-            segment.write_to(snapshot)
+            segment.write_to(snapshot, begins_file=segment is first)
         snapshot.encoders += [segment.encoder for segment in self.open if not segment.discarded]
         self._ring.clear()
         self._tell(f"{path}: {held_s:.1f} s before and what follows; {event}")

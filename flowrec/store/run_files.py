@@ -20,7 +20,7 @@ from typing import Self
 
 from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds
 from flowrec.store.byte_source import is_there, open_bytes
-from flowrec.store.mcap_reader import UnfinishedError
+from flowrec.store.mcap_format import UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata
 from flowrec.store.session_path import UrlPath, session_path
 
@@ -332,7 +332,7 @@ def session_sha256(files: Sequence[Path]) -> str:
     """SHA-256 of a session, by which a replay names its parent: of its file, or of its parts in order."""
     digest = hashlib.sha256()
     for path in files:
-        with contextlib.closing(open_bytes(path)) as source:
+        with open_bytes(path) as source:
             for offset in range(0, source.size, _HASHED_BYTES):
                 source.prefetch((at, _HASHED_BYTES) for at in range(offset, offset + 4 * _HASHED_BYTES, _HASHED_BYTES))
                 digest.update(source.read(offset, min(_HASHED_BYTES, source.size - offset)))

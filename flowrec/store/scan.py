@@ -17,7 +17,7 @@ from mcap.records import ChunkIndex
 
 from flowrec.core import SessionError
 from flowrec.store.digest import message_digest
-from flowrec.store.lookup_record import LOOKUP_OPCODE
+from flowrec.store.lookup import LOOKUP_OPCODE
 from flowrec.store.mcap_format import CHUNK_HEAD, CHUNK_LIMIT_BYTES, DECLARED_LIMIT, MAGIC, RECORD_HEAD, Record, Summary
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.session_metadata import CONFIG_FILE, OUTCOME

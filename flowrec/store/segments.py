@@ -13,17 +13,17 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic, TypeVar
 
 from flowrec.core import Drops, Frame, SessionError, remove_idle
-from flowrec.store.channels import FRAME_PATH
-from flowrec.store.chunk import ChunkEncoder, Sink
+from flowrec.store.channels import FRAME_PATH, FRAMES
+from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.codec import codec_of, encode_record
+from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.mcap_writer import FileError
 from flowrec.store.run_files import run_files
 from flowrec.store.session_file import SessionFile, WriterOptions
@@ -52,27 +52,54 @@ class RecordingPlan:
     replaced: Mapping[Path, int]
 
 
-class Segment(ABC):
-    """Takes the entries of consecutive ticks.
+class Segment:
+    """Consecutive ticks of a run: a part of it, or a slice of the ring buffer.
+
+    Its chunks go to a file; until it has one they stay in memory.
 
     Attributes
     ----------
     encoder : of its messages.
-    keyframe_ns : stamp of the last tick before it; None at the beginning of the run.
+    keyframe : the state at the last tick before it, without the image; None at the beginning of the run.
+    sequences : the next sequence numbers when it began.
     file : that its chunks go to; None: they stay in memory.
+    begins_file : it is the first one in its file.
+    held, held_image : its chunks in memory, and that of the last image before it.
+    image_bytes : size of the latter, wherever it is.
     begin_ns : stamp of its first tick; None before that.
     awaited, awaited_bytes : number and size of the images that were announced and are still queued.
     raw_bytes : size of what was added.
+    discarded : it is too old before all of its images have come, and takes no more.
     """
 
-    def __init__(self, encoder: ChunkEncoder, keyframe_ns: int | None, file: SessionFile | None = None) -> None:
-        self.encoder, self.keyframe_ns, self.file = encoder, keyframe_ns, file
+    def __init__(self, encoder: ChunkEncoder, keyframe: Entry | None) -> None:
+        self.encoder, self.keyframe, self.sequences = encoder, keyframe, Counter(encoder.sequences)
+        self.file: SessionFile | None = None
+        self.begins_file = self.discarded = False
+        self.held: list[SealedChunk] = []
+        self.held_image: list[SealedChunk] = []
         self.begin_ns: int | None = None
         self.counters = Counters()
-        self.awaited = self.awaited_bytes = self.raw_bytes = 0
+        self.image_bytes = self.awaited = self.awaited_bytes = self.raw_bytes = 0
+        encoder.sink = self._hold
+
+    @property
+    def keyframe_ns(self) -> int | None:
+        """Stamp of the keyframe."""
+        return self.keyframe.stamp_ns if self.keyframe is not None else None
+
+    def write_to(self, file: SessionFile, *, begins_file: bool) -> None:
+        """Write the chunks in memory, and later ones, to a file; where that begins, the image before them as well."""
+        self.file, self.begins_file = file, begins_file
+        self.keyframe = self.keyframe and self.keyframe._replace(messages={})  # they are written, or not needed
+        file.put([*(self.held_image if begins_file else ()), *self.held])
+        self.held, self.held_image = [], []
+        self.encoder.sink = file.put
 
     def add(self, entry: Entry) -> None:
         """Take one entry."""
+        if self.discarded:
+            return
         self.raw_bytes += entry.nbytes
         if self.file is not None:
             self.file.note(entry.stamp_ns)
@@ -83,15 +110,36 @@ class Segment(ABC):
                 raise
             raise self.file.encoding_failed(error) from error
 
-    @abstractmethod
-    def add_keyframe_image(self, entry: Entry) -> None:
-        """Take the last image before the segment, which was still queued when the segment began."""
+    def add_keyframe_image(self, image: Frame) -> None:
+        """Take the last image before it, which was still queued when it began, as a chunk of its own."""
+        if self.keyframe is None or (self.file is not None and not self.begins_file):
+            return  # the segment before it is in the same file
+        sink, self.encoder.sink = self.encoder.sink, self._take_image
+        self.encoder.add(Entry(self.keyframe.stamp_ns, {"frame": image}, 0))
+        self.encoder.seal((FRAMES,))
+        self.encoder.sink = sink
+
+    def _take_image(self, chunks: list[SealedChunk]) -> None:
+        self.image_bytes += _size_of(chunks)
+        if self.file is not None:
+            self.file.put(chunks)
+        else:
+            self.held_image += copy_chunks(chunks)
+
+    def _hold(self, chunks: list[SealedChunk]) -> None:
+        self.held += copy_chunks(chunks)
+
+    @property
+    def held_bytes(self) -> int:
+        """Size of its chunks in memory."""
+        return _size_of(self.held) + _size_of(self.held_image)
 
 
-S = TypeVar("S", bound=Segment)
+def _size_of(chunks: list[SealedChunk]) -> int:
+    return sum(len(chunk.data) for chunk in chunks)
 
 
-class SegmentedRun(ABC, Generic[S]):
+class SegmentedRun(ABC):
     """The files of a run while they are written; each entry goes to the segment that it belongs to.
 
     Raises SessionError: from any method, when the disk refuses, or a message can not be encoded.
@@ -110,7 +158,7 @@ class SegmentedRun(ABC, Generic[S]):
 
     def __init__(self, plan: RecordingPlan, tell: Callable[[str], None]) -> None:
         self.files: list[Path] = []
-        self.open: deque[S] = deque()
+        self.open: deque[Segment] = deque()
         self.dropped = 0
         self._plan, self._path, self._header, self._options = plan, plan.path, plan.header, plan.options
         self._tell = tell
@@ -202,9 +250,35 @@ class SegmentedRun(ABC, Generic[S]):
         self._header = replace(self._header, start_unix_ns=start_unix_ns)
         self.open[-1].encoder.start_unix_ns = start_unix_ns
 
-    @abstractmethod
     def add(self, entry: Entry) -> None:
         """Take one entry."""
+        self._collect_finished()
+        if entry.ticks:
+            self._cut_before(entry.stamp_ns)
+        # Images come in order: those of an earlier segment have all come before the first one of a later segment.
+        segment = self.open[0] if entry.late else self.open[-1]
+        if entry.ticks and segment.begin_ns is None:
+            segment.begin_ns = entry.stamp_ns
+        segment.counters.add(entry)
+        segment.add(entry)
+        if entry.late:
+            segment.awaited -= 1
+            segment.awaited_bytes -= entry.nbytes
+        else:
+            self._last_ns = entry.stamp_ns
+            self._state.update(entry.messages)
+            self._state.pop("frame", None)
+            if entry.image_bytes:
+                segment.awaited += 1
+                segment.awaited_bytes += entry.image_bytes
+        image = entry.messages.get("frame")
+        if isinstance(image, Frame):
+            self._image = image
+        self._end_complete()
+
+    @abstractmethod
+    def _cut_before(self, stamp_ns: int) -> None:
+        """End the current segment, where it is time to, before a tick."""
 
     def flush_if_due(self) -> None:
         """Write and sync the data whose interval has passed."""
@@ -229,7 +303,7 @@ class SegmentedRun(ABC, Generic[S]):
             file.close()
 
     @abstractmethod
-    def _end(self, segment: S) -> None:
+    def _end(self, segment: Segment) -> None:
         """Take a segment that has received all of its entries."""
 
     @property
@@ -237,34 +311,25 @@ class SegmentedRun(ABC, Generic[S]):
         """The files that have not received all that belongs into them."""
         return [file for file in self._unfinished if file.completion is None]
 
-    def _encoder(self, sink: Sink) -> ChunkEncoder:
+    def _encoder(self) -> ChunkEncoder:
+        """An encoder whose chunks go nowhere until a segment uses it."""
         options = self._options
-        return ChunkEncoder(options.encoding, sink, self._header.start_unix_ns, options.topics)
+        return ChunkEncoder(options.encoding, lambda _: None, self._header.start_unix_ns, options.topics)
 
-    def _route(self, entry: Entry) -> None:
-        """Pass one entry to its segment."""
-        # Images come in order: those of an earlier segment have all come before the first one of a later segment.
-        segment = self.open[0] if entry.late else self.open[-1]
-        if entry.ticks and segment.begin_ns is None:
-            segment.begin_ns = entry.stamp_ns
-        segment.counters.add(entry)
-        segment.add(entry)
-        if entry.late:
-            segment.awaited -= 1
-            segment.awaited_bytes -= entry.nbytes
-        else:
-            self._last_ns = entry.stamp_ns
-            self._state.update(entry.messages)
-            self._state.pop("frame", None)
-            if entry.image_bytes:
-                segment.awaited += 1
-                segment.awaited_bytes += entry.image_bytes
-        image = entry.messages.get("frame")
-        if isinstance(image, Frame):
-            self._image = image
-        self._end_complete()
+    def _begin_file(self, file: SessionFile, segment: Segment) -> None:
+        """Write the keyframe of the first segment of a file."""
+        self._unfinished.append(file)
+        if segment.keyframe is not None:
+            encoder = self._encoder()
+            # Numbered as if they had been written just before what follows.
+            encoder.sequences = Counter({topic: (number - 1) % 2**32 for topic, number in segment.sequences.items()})
+            file.write_keyframe(encoder, segment.keyframe)
 
-    def _cut(self, following: S) -> None:
+    def _state_now(self) -> Entry | None:
+        """The keyframe of a segment that begins now."""
+        return Entry(self._last_ns, dict(self._state), 0) if self._last_ns is not None else None
+
+    def _cut(self, following: Segment) -> None:
         """End the current segment with the last tick; the ticks from here on go to another one."""
         self.open.append(following)
         self._end_complete()
@@ -272,9 +337,8 @@ class SegmentedRun(ABC, Generic[S]):
     def _end_complete(self) -> None:
         while len(self.open) > 1 and not self.open[0].awaited:
             self._end(self.open.popleft())
-            following = self.open[0]
-            if self._image is not None and following.keyframe_ns is not None:
-                following.add_keyframe_image(Entry(following.keyframe_ns, {"frame": self._image}, 0))
+            if self._image is not None:
+                self.open[0].add_keyframe_image(self._image)
 
     def _complete(self, file: SessionFile, outcome: Mapping[str, str], counters: Counters) -> None:
         """Complete a file in the side thread."""

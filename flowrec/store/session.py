@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import hashlib
-import html
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from flowrec.core import (
+    Closing,
     Figures,
     FlowrecError,
     NotFiniteError,
@@ -24,7 +23,6 @@ from flowrec.core import (
     parse_toml,
     rows_for_people,
     seconds,
-    text_for_picture,
     verdict_lines,
 )
 from flowrec.store.notes import Note, append_note, read_notes
@@ -33,10 +31,8 @@ from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.store.session_path import session_path
 
 if TYPE_CHECKING:
-    import numpy as np
     import pyarrow as pa
     import xarray
-    from numpy.typing import NDArray
 
     from flowrec.core import Event, FlowField, Tick
     from flowrec.physics import Calibration, Chip
@@ -45,8 +41,6 @@ if TYPE_CHECKING:
     from flowrec.store.stream_samples import Channel
     from flowrec.store.tables import Tables
 
-_CARD_PX = 240  # width of the picture of a card
-_CARD_TEXT, _CARD_SENTENCE = 200, 600  # characters of a value, of a sentence
 _CARD_FIGURES = ("tracking_error_um", "contacts", "frames_dropped", "covered")  # that no sentence states
 _LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
@@ -78,7 +72,7 @@ class FlowFields(dict[str, "FlowField"]):
         return every.assign_coords(method=("field", [field.method for field in self.values()]))
 
 
-class Session:
+class Session(Closing):
     """A finished session, or one finished part of a run, open for reading; it never writes.
 
     X.mcap is that file or, if there is none, the run with the parts X.part001.mcap and so on. Times are session
@@ -302,17 +296,13 @@ class Session:
         if "reader" in vars(self):
             self.reader.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def __repr__(self) -> str:
         return f"Session({str(self.path)!r})"
 
     def _repr_html_(self) -> str:
         """A card for notebooks: how the run ended, with what, and the image in its middle, or the chip without one."""
+        from flowrec.store.session_card import card
+
         frames, outcome, last = self.frames, self.outcome, self.last
         image = frames[len(frames) // 2].image if len(frames) else self.chip.mask.astype("uint8")
         recorded = {name: self.provenance.get(name, "") for name in ("wall_time", "operator", "sample", "notes")}
@@ -380,51 +370,3 @@ def _absurd_numbers(session: Session) -> Iterator[str]:
             for name in invalid_numbers(message, _LARGEST_NUMBER):
                 at_s = seconds(message.stamp_ns - session.run.first_ns)
                 yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or an impossibly large number"
-
-
-def card(
-    title: str,
-    rows: Iterable[tuple[str, str]],
-    image: NDArray[np.uint8 | np.uint16] | None,
-    verdict: Iterable[str] = (),
-) -> str:
-    """HTML without scripts and links.
-
-    Parameters
-    ----------
-    rows : names and values, from a file, so not to be trusted.
-    image : (h, w) grey levels, which are stretched to the full range; None: no picture.
-    verdict : sentences above the rows, likewise; the first one is bold.
-    """
-    cells = "".join(
-        f'<tr><td style="text-align:left">{_escape(name)}</td><td style="text-align:left">{_escape(value)}</td></tr>'
-        for name, value in rows
-    )
-    data = base64.b64encode(_thumbnail(image)).decode() if image is not None and image.size else ""
-    picture = f'<img alt="camera image" width="{_CARD_PX}" src="data:image/png;base64,{data}"/>' if data else ""
-    sentences = "".join(
-        f"<div>{_escape(text, _CARD_SENTENCE) if number else f'<b>{_escape(text)}</b>'}</div>"
-        for number, text in enumerate(verdict)
-    )
-    return (
-        '<div style="display:flex;gap:1em;align-items:flex-start;border:1px solid #8888;border-radius:6px;padding:8px;'
-        f'max-width:52em">{picture}<div>{sentences}<div style="margin-top:4px">{_escape(title)}</div>'
-        f"<table>{cells}</table></div></div>"
-    )
-
-
-def _escape(text: str, longest: int = _CARD_TEXT) -> str:
-    return html.escape(text_for_picture(text, longest))
-
-
-def _thumbnail(image: NDArray[np.uint8 | np.uint16]) -> bytes:
-    """A PNG as wide as the card shows it."""
-    import cv2
-    import numpy as np
-
-    scale = min(1.0, 2 * _CARD_PX / image.shape[1])  # sharp on screens with two pixels a point
-    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float64)
-    low, high = np.quantile(small, (0.001, 0.999))
-    grey = np.clip((small - low) / max(high - low, 1.0) * 255.0, 0, 255).astype(np.uint8)
-    return bytes(cv2.imencode(".png", grey)[1])

@@ -14,20 +14,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.records import Metadata
-
 from flowrec.core import FIXED, SessionError, TopicTable, __version__, name_taken, put_in_place, seconds, sync_directory
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import ChunkEncoder, copy_chunks
+from flowrec.store.file_end import end_file
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
-from flowrec.store.gathered_copies import gather
 from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.mcap_writer import FileError, disk_errors, new_mcap, not_writable
 from flowrec.store.roi import Region
 from flowrec.store.run_files import partial_path
-from flowrec.store.session_metadata import OUTCOME, PROFILE, SessionHeader, header_records
+from flowrec.store.session_metadata import PROFILE, SessionHeader, header_records
 from flowrec.store.signature import signature_file
-from flowrec.store.viewer_pass import draw
 from flowrec.store.viewer_scene import ChipCamera
 from flowrec.store.write_queue import Entry
 
@@ -319,15 +316,8 @@ class SessionFile:
         self._side.shutdown()
         self.check()
         with self._mark_failed():
-            self._file.add(Metadata(OUTCOME, dict(outcome)))  # before the drawings: without them nothing is lost
-            if self.partial_path.exists():  # else its folder was renamed: recovery draws
-                left_out = self._options.left_out_topics
-                draw(self.partial_path, self._file, camera, self._start_unix_ns, left_out, outcome)
-                for copies in gather(self.partial_path, self._file.summary(), self._start_unix_ns):
-                    self._file.add(copies)
-            self._file.add_digest()
-            self._file.finish()
-            self._file.sync()
+            left_out = self._options.left_out_topics
+            end_file(self.partial_path, self._file, outcome, camera, self._start_unix_ns, left_out)
             try:
                 put_in_place(self.partial_path, self.path, overwrite=self._options.overwrite)
                 signature_file(self.path).unlink(missing_ok=True)  # of the file that was replaced

@@ -11,13 +11,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from mcap.records import Attachment, Metadata, Statistics
 
-from flowrec.core import NS_PER_S, SessionError, __version__, nanoseconds, parse_toml
-from flowrec.store.mcap_format import Summary
-from flowrec.store.mcap_reader import ForeignError, McapReader
+from flowrec.core import NS_PER_S, Closing, SessionError, __version__, nanoseconds, parse_toml
+from flowrec.store.mcap_format import ForeignError, Summary
+from flowrec.store.mcap_reader import McapReader
+from flowrec.store.older_files import outcome_of_today
 
 if TYPE_CHECKING:
     from flowrec.physics import Chip
@@ -155,7 +156,7 @@ def is_header_file(name: str) -> bool:
     return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith((_WEIGHTS, _PICTURES))
 
 
-class SessionMetadata:
+class SessionMetadata(Closing):
     """The index and the metadata of a session file.
 
     Raises SessionError: it is no session file, or not one for this flowrec.
@@ -203,7 +204,7 @@ class SessionMetadata:
             )
         self.flowrec_version = records[SESSION].get("flowrec_version", "?")[:_SHOWN]
         self._check_version(records[SESSION].get("format_version", ""))
-        self.outcome = records.get(OUTCOME, {})
+        self.outcome = outcome_of_today(records.get(OUTCOME, {}))
         self.digest = records.get(DIGEST)
         with self.source.parsing(0):
             self.part = _part_of(records)
@@ -227,12 +228,6 @@ class SessionMetadata:
             if chunk.message_start_time <= stamp_ns:
                 counts.update(record.channel for record in self.source.messages(chunk) if record.log_ns <= stamp_ns)
         return self._by_topic(counts)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the file; a forgotten one is closed when it is collected."""

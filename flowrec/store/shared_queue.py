@@ -27,7 +27,7 @@ _STATE_BYTES = 160 << 20  # twice a tick of 80 MB, which always has room in an e
 _IMAGE_BYTES = 64 << 20
 _MARGIN_BYTES = 1 << 20
 _POLL_S = 0.0005
-_PARENT_S = 1.0
+_PARENT_S = 1.0  # between two looks whether the run is still there
 _HEAD = struct.Struct("<I")
 _FLUSHED, _WANTED, _DROP, _FILES = range(4)  # words of the ring of the state
 

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     COILS,
     FIXED,
+    Floats,
     Frame,
     MessageField,
     Observations,
@@ -167,7 +167,7 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
     return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um)
 
 
-def _given_columns(given: Any) -> tuple[str, dict[str, NDArray[np.float64]]]:
+def _given_columns(given: Any) -> tuple[str, dict[str, Floats]]:
     """Name of a table for errors, and its columns; what may be left out and is empty is left out."""
     if isinstance(given, str | Path):
         table = read_table(Path(given))

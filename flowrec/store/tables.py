@@ -16,7 +16,9 @@ from flowrec.core import (
     FIXED,
     NS_PER_S,
     VALUES,
+    Bools,
     FlowField,
+    Ints,
     Observations,
     SessionError,
     TopicTable,
@@ -137,7 +139,7 @@ def _lists(column: Column, cells: tuple[Any, ...]) -> pa.Array:
     return pa.ListArray.from_arrays(_offsets(lengths), values, mask=mask)
 
 
-def _offsets(lengths: NDArray[np.int64]) -> pa.Array:
+def _offsets(lengths: Ints) -> pa.Array:
     return pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
 
 
@@ -148,7 +150,7 @@ def observed_flow(observations: Observations) -> pa.Table:
     return _table(OBSERVED, (*place, *flow, observations.std_um_s, *rolled, observations.time_s))
 
 
-def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
+def field_values(field: FlowField, fluid: Bools) -> pa.Table:
     """A flow field with a row for each pixel of fluid. `fluid`: (h, w), where the chip holds fluid."""
     columns = zip(VALUES, values_of(field, fluid).T, strict=True)
     return _table(VALUES, [None if field.std_um_s is None and "std" in name else values for name, values in columns])

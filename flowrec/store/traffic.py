@@ -15,7 +15,7 @@ from typing import TypeVar
 from flowrec.core import SessionError, UsageError
 
 TIMEOUT_KEY = "FLOWREC_TIMEOUT_S"  # environment variable; the option --timeout sets it
-_TIMEOUT_S = 30.0
+_TIMEOUT_S = 30.0  # of a request, with all of its tries
 _TRIES, _PAUSE_S = 4, 0.2  # of a request; the pause before the second try, doubled each time
 _NAMED = 3  # causes of repetitions that are named
 _Answered = TypeVar("_Answered")

@@ -14,7 +14,7 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.core import MM_PER_UM, Estimate, FlowField, Route, Track, fluid_of
+from flowrec.core import MM_PER_UM, Estimate, Floats, FlowField, Route, Track, fluid_of
 from flowrec.store.codec import Payload, byte_field_head
 from flowrec.store.viewer_scene import CHIP, MAP, STILL, Picture, ViewerScene, speed_um_s
 
@@ -100,7 +100,7 @@ def route_mark(stamp_ns: int, scene: ViewerScene) -> Payload:
     return parts
 
 
-def thin_line(points_um: NDArray[np.float64], step_um: float) -> NDArray[np.float64]:
+def thin_line(points_um: Floats, step_um: float) -> Floats:
     """Points (n, 2) of a line: the first of each step along it, and its last one."""
     if len(points_um) < 2:
         return points_um
@@ -109,7 +109,7 @@ def thin_line(points_um: NDArray[np.float64], step_um: float) -> NDArray[np.floa
     return points_um[keep]
 
 
-def distance_um(points_um: NDArray[np.float64]) -> NDArray[np.float64]:
+def distance_um(points_um: Floats) -> Floats:
     """(n,) distance from the first of the points (n, 2), along them."""
     steps = np.hypot(*np.diff(points_um, axis=0).T)
     return np.concatenate((np.zeros(min(len(points_um), 1)), np.cumsum(steps)))
@@ -191,12 +191,12 @@ def _ring(radius_um: float, rgba: Rgba) -> bytes:
     return _cloud(_RING_RADII * radius_um * _circle_points(), rgba, placed=False).encode()
 
 
-def _circle_points() -> NDArray[np.float64]:
+def _circle_points() -> Floats:
     angle = np.arange(_RING_POINTS) * (2.0 * np.pi / _RING_POINTS)
     return np.stack((np.cos(angle), np.sin(angle)), 1)
 
 
-def _cloud(points_um: NDArray[np.float64], rgba: Rgba, *, placed: bool = True) -> fg.PointCloud:
+def _cloud(points_um: Floats, rgba: Rgba, *, placed: bool = True) -> fg.PointCloud:
     """Points (n, 2) on the chip; they are about a pose that follows where they are not `placed`."""
     points = np.zeros(len(points_um), [("at", "<f4", 3), ("colour", "u1", 4)])
     points["at"][:, :2], points["colour"] = MM_PER_UM * points_um, rgba
@@ -225,9 +225,7 @@ def _circle(stamp: bytes, place_px: tuple[float, float], radius_px: float, width
     return _part(_CIRCLES, stamp, circle.encode())
 
 
-def _line(
-    stamp: bytes, points_px: NDArray[np.float64], kind: fg.PointsAnnotationType, width_px: int, rgba: Rgba
-) -> Payload:
+def _line(stamp: bytes, points_px: Floats, kind: fg.PointsAnnotationType, width_px: int, rgba: Rgba) -> Payload:
     """A line as a part of ImageAnnotations."""
     points = [fg.Point2(x=x, y=y) for x, y in points_px.tolist()]
     return _part(_POINTS, stamp, fg.PointsAnnotation(type=kind, points=points, **_look(width_px, rgba)).encode())

@@ -21,9 +21,21 @@ from typing import TypeVar
 
 import numpy as np
 from foxglove import messages as fg
-from numpy.typing import NDArray
 
-from flowrec.core import HALF_PX, MM_PER_UM, FlowField, FlowrecError, Matrix, Message, Mission, Route, Shift, shift_px
+from flowrec.core import (
+    HALF_PX,
+    MM_PER_UM,
+    Floats,
+    Floats32,
+    FlowField,
+    FlowrecError,
+    Matrix,
+    Message,
+    Mission,
+    Route,
+    Shift,
+    shift_px,
+)
 from flowrec.physics import Calibration, on_chip
 from flowrec.store.codec import timestamp
 from flowrec.store.frame_encodings import CAMERA_FRAME
@@ -34,7 +46,7 @@ ROOT, CHIP, MAP = "tf#/", "chip", "map"
 LENGTHS, UNIT = "lengths", "mm"  # key and value in the metadata of viewer topics; absent in older files: m
 HEIGHT = {"mm": 3.0, "m": 0.2}  # of the cameras over the chip; Rerun clips what is nearer than 0.1
 _RADIUS_UM = 60.0  # of a robot whose size is not known
-_Number = TypeVar("_Number", float, NDArray[np.float64])
+_Number = TypeVar("_Number", float, Floats)
 STILL, _OVER = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0), fg.Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)
 
 
@@ -66,7 +78,7 @@ class Picture:
         back = np.linalg.inv(self.matrix[:, :2])
         return np.column_stack((back, HALF_PX - back @ self.matrix[:, 2])).tolist()
 
-    def to_px(self, points_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_px(self, points_um: Floats) -> Floats:
         """Chip points (n, 2) in um as pixels (n, 2), counted from the corner of the first."""
         x, y = self.pixel(points_um[..., 0], points_um[..., 1])
         return np.stack((x, y), -1)
@@ -166,7 +178,7 @@ class ViewerScene:
         self.refined: FlowField | None = None
         self.field: FlowField | None = None
         self.route: Route | None = None
-        self.goal_um: NDArray[np.float64] | None = None
+        self.goal_um: Floats | None = None
         self.picture = camera.picture(None) if camera is not None else None
         self.map: Picture | None = None
         self._shift: Shift | None = None
@@ -182,7 +194,7 @@ class ViewerScene:
         share = self.field.error_share if self.field is not None else None
         return math.nan if share is None else share
 
-    def place_um(self, measured_um: NDArray[np.float64]) -> tuple[float, float]:
+    def place_um(self, measured_um: Floats) -> tuple[float, float]:
         """Place on the chip of one measured place (2,), quicker than `on_chip` of flowrec.physics."""
         x, y = measured_um.tolist()
         if self.refined is None or self.refined.registration is None:
@@ -243,9 +255,9 @@ def drawable(field: FlowField) -> bool:
     return field.velocity_um_s.shape[2:] == (2,) and field.velocity_um_s.size > 0
 
 
-def speed_um_s(field: FlowField) -> NDArray[np.float32]:
+def speed_um_s(field: FlowField) -> Floats32:
     """(h, w) speed; 0 where it is not finite."""
     with np.errstate(over="ignore"):
-        speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
+        speed: Floats32 = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
     np.nan_to_num(speed, copy=False, posinf=0.0)
     return speed

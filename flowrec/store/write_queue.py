@@ -23,7 +23,7 @@ EncodedMessages = dict[str, Encoded | Frame]  # the same, as they are stored; im
 # One in 2, 4, 8 and 16 images is kept when the queue is filled to these ratios.
 _DECIMATE_ABOVE = (0.5, 0.625, 0.75, 0.875)
 _RESTORE_BELOW = 0.125  # far below the first threshold, so that the rate does not oscillate
-_RESTORE_AFTER_S, _LONGEST_RESTORE_AFTER_S = 1.0, 32.0
+_RESTORE_AFTER_S, _LONGEST_RESTORE_AFTER_S = 1.0, 32.0  # wait before a rate is restored; it doubles up to the second
 
 
 class Entry(NamedTuple):

@@ -47,8 +47,8 @@ from flowrec.stages import Config, Pipeline, ResolvedConfig, assemble, load_conf
 from flowrec.store import SessionWriter, session_writer
 from flowrec.verbs.interactive import Unattended
 
-_ENOUGH = 0.95  # of the camera's rate: the rest is what two seconds can tell
-_TRIES = 3  # a moment without the processor is no lack of it
+_ENOUGH = 0.95  # of the camera's rate, which a trial of two seconds does not measure more exactly
+_TRIES = 3  # one moment without a processor does not show that the machine is too slow
 _PATIENCE_S = 2.0  # for what waits for the disk after the last image
 _SETTLE_S = 0.1  # after the last image until it is written, on a machine with time to spare
 _POLL_S = 0.005

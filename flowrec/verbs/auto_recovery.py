@@ -36,10 +36,10 @@ def leftovers(folder: Path) -> list[Path]:
 
 
 def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> dict[Path, str]:
-    """Recover small unfinished sessions and print the command for larger ones, a line for each; never raises for one.
+    """Recover small unfinished sessions, and print the command for larger ones; a failure is a printed line, too.
 
-    `excluded`: remains to leave locked, because they will be overwritten. Returns the recovered sessions, each with a
-    summary.
+    `excluded`: files that are left as they are, because the run overwrites them. Returns the recovered sessions, each
+    with a summary.
     """
     unfinished = [path for path in leftovers(folder) if path.resolve() not in excluded]
     if not unfinished:

@@ -228,8 +228,7 @@ class FileCheck:
         if not images and is_left_out(FRAME_PATH, leave_out):
             verdict.fact("images", "none: recording.leave_out, the recorded tracks stand in")
             return
-        # The outcome of the first release has the count of the writer under both names.
-        dropped = max(tally.dropped, *(_count(found.outcome, key) for key in ("dropped_frames", "frames_dropped")))
+        dropped = max(tally.dropped, _count(found.outcome, "dropped_frames"))
         verdict.figures |= {"frames": images, "frames_dropped": dropped}
         verdict.fact("images", f"{images} for {tally.ticks} ticks; {dropped} dropped by the writer")
         if found.region is not None:

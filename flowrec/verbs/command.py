@@ -1,7 +1,7 @@
 """Verbs as commands: options, help, --json, output and exit status of a command follow from the function of a verb.
 
 A verb is a function with `verb` above it. A parameter that is annotated as an option or an argument of typer is one of
-its command, too: a union means the first of its types to the terminal. The value of one with the mark `Supplied` is
+its command, too; of a union the terminal has the first type. The value of one with the mark `Supplied` is
 made for the call. Every other parameter is Python's alone. The command line imports the modules of all verbs, so these
 import what takes long within their functions, and do without `from __future__ import annotations`: types that are
 imported for the type checker alone stand in quotes.

@@ -27,7 +27,7 @@ _SETTINGS: dict[str, Any] = {
     "robot.delay_s": 0.05,
     "chip.inlet_speed_um_s": 40.0,
     "mission.goal": [1100.0, 2700.0],
-    # A computer that does the work of all devices, too, stops the recorder for longer than that of a lab.
+    # This computer does the work of all devices, too, and so stops the recorder for longer than one in a lab.
     "lab.guardian_s": 0.3,
     "lab.camera_timeout_s": 0.5,
     "safety.guard_timeout_s": 1.5,

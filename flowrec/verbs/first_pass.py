@@ -39,8 +39,8 @@ from flowrec.stages import (
     MOST,
     Config,
     FieldLog,
-    MovieSettings,
     Pipeline,
+    ResolvedConfig,
     Sight,
     TrackQuality,
     View,
@@ -94,7 +94,7 @@ def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: 
 
     Parameters
     ----------
-    looked_at : the same configuration with the log where it overlaps the movie.
+    looked_at : the same configuration, with the log moved to where it overlaps the movie.
     robots : which bodies are the robots, the mission's one first: of each a number of the picture, "X,Ypx" in pixels
         of the first image, or "X,Y" in um on the chip; none: the only one that qualifies, or the one of
         tracker.click_px or box_px, or the tracker.robots most similar discs.
@@ -107,20 +107,20 @@ def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: 
     if robot and marked:
         raise UsageError(f"--robot {robot}: tracker.click_px, box_px or robots_px is set too; give one of them")
     prepared = prepare(looked_at, aloud=False)  # the import says it, of the settings that are used
-    p, movie = prepared.pipeline, looked_at.movie
+    p, config = prepared.pipeline, prepared.config
     several = len(named) > 1 or asks.count > 1
     place_px = None if several else _place_of(robot, asked, p)
     if several:
-        asked = _with_robots(asked, p, movie, prepared, named) if named else asked
+        asked = _with_robots(asked, p, config, named) if named else asked
     elif place_px is not None:
         asked = replace(asked, tracker=replace(asked.tracker, click_px=place_px))
-    elif not marked and (seen := _first_seen(p, movie, prepared)) is not None:
+    elif not marked and (seen := _first_seen(p, config)) is not None:
         asked = _with_chosen_body(asked, p, *seen, robot, folder)
     chosen = {name: getattr(asked.tracker, name) for name in ("click_px", "click_frame", "robots", "robots_px")}
     p = replace(p, tracker=replace(p.tracker, **chosen))
     if place_px is not None:
-        _refuse_empty(robot, p, movie, prepared)
-    shifts_px, tracks = _look_through(p, movie, prepared)
+        _refuse_empty(robot, p, config)
+    shifts_px, tracks = _look_through(p, config)
     facts: Mapping[str, str] = {}
     if p.stabiliser.on:
         first_px = asked.stabilise.first_px
@@ -131,11 +131,11 @@ def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: 
     return Looked(asked, facts, prepared, tracks)
 
 
-def _with_robots(asked: Config, p: Pipeline, movie: MovieSettings, prepared: Prepared, robots: Sequence[str]) -> Config:
+def _with_robots(asked: Config, p: Pipeline, config: ResolvedConfig, robots: Sequence[str]) -> Config:
     """The configuration with a point on each of several robots in the first image; UsageError where there is none."""
     alone = replace(p, tracker=replace(p.tracker, robots=1, robots_px=()))
-    with MovieSource(movie, prepared.config.coils) as source:
-        image = next(iter(_within(source, prepared)))
+    with MovieSource(config.movie, config.coils) as source:
+        image = next(iter(_within(source, config)))
     candidates, _ = _candidates(p, image, look(alone, Sight(), image))
     places_px = [_place_of(each, asked, p) or _place_of_number(each, candidates, image, asked) for each in robots]
     count = max(asked.tracker.robots, len(places_px))
@@ -162,20 +162,20 @@ def _place_of_number(robot: str, places_px: Floats, image: Frame, asked: Config)
     return x, y
 
 
-def _refuse_empty(robot: str, p: Pipeline, movie: MovieSettings, prepared: Prepared) -> None:
+def _refuse_empty(robot: str, p: Pipeline, config: ResolvedConfig) -> None:
     """Raise UsageError where the first image shows no body at the place that was given."""
-    with MovieSource(movie, prepared.config.coils) as source:
-        sight = look(p, Sight(), next(iter(_within(source, prepared))))
+    with MovieSource(config.movie, config.coils) as source:
+        sight = look(p, Sight(), next(iter(_within(source, config))))
     if sight.appearance is not None and sight.appearance.note:
         told = sight.appearance.note.replace("tracker.click_px =", "the pixels")
         raise UsageError(f"--robot {robot}: {told}")
 
 
-def _first_seen(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> tuple[Frame, Sight] | None:
+def _first_seen(p: Pipeline, config: ResolvedConfig) -> tuple[Frame, Sight] | None:
     """The first image that shows the robot, or the first one where none does."""
     first, sight = None, Sight()
-    with MovieSource(movie, prepared.config.coils) as source:
-        for frame in _within(source, prepared):
+    with MovieSource(config.movie, config.coils) as source:
+        for frame in _within(source, config):
             sight = look(p, sight, frame)
             first = first or (frame, sight)
             if sight.track is not None and sight.track.seen:
@@ -183,24 +183,22 @@ def _first_seen(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> tuple[
     return first
 
 
-def _within(source: MovieSource, prepared: Prepared) -> Iterator[Frame]:
+def _within(source: MovieSource, config: ResolvedConfig) -> Iterator[Frame]:
     """The images that are imported."""
-    duration_s = prepared.config.duration_s
-    return itertools.takewhile(
-        lambda frame: duration_s is None or seconds(frame.stamp_ns) <= duration_s, source.frames()
-    )
+    end_s = math.inf if config.duration_s is None else config.duration_s
+    return itertools.takewhile(lambda frame: seconds(frame.stamp_ns) <= end_s, source.frames())
 
 
-def _look_through(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> tuple[Floats, MovieTracks | None]:
+def _look_through(p: Pipeline, config: ResolvedConfig) -> tuple[Floats, MovieTracks | None]:
     """Shifts (n, 2) of all images in px, (0, 2) if they can not be measured; the robot's track, None without a log."""
     quality = TrackQuality(p.calibration, p.image_shape, p.robot)
     sight, seen, shifts = Sight(), list[Track](), list[Floats]()
     # The shift is measured, too, where it is not taken out of the track.
     stabilised, measures = bool(p.stabiliser.on), replace(p.stabiliser, on=True)
     shift, background = None, None
-    with MovieSource(movie, prepared.config.coils) as source:
+    with MovieSource(config.movie, config.coils) as source:
         log = source.log
-        for frame in _within(source, prepared):
+        for frame in _within(source, config):
             if log is not None:
                 sight = look(p, sight, frame)
                 assert sight.track is not None, "the tracker says of every image whether it shows the robot"

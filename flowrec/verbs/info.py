@@ -24,12 +24,11 @@ if TYPE_CHECKING:
 
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
 _PNG_SIZE_AT = 16  # bytes, after the signature and the head of the first part
-_REPEATED = ("reason", "duration")  # the second is a sentence of older files
 _STATED = ("seed", "world", "operator", "sample", "notes")  # in the provenance
 _OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance
 # Shown with another fact, or not at all.
 _WITHIN_OTHERS = ("note", "parts", "commit", "local_changes", "chip_width_um", "chip_height_um", "chip_openings")
-_NOT_SHOWN = ("duration", "wall_ns", "monotonic_ns")
+_NOT_SHOWN = ("wall_ns", "monotonic_ns")
 _DRIVES = ("speed_um_s", "pressure_pa")  # of an opening
 _STAGES = ("observer", "refine", "plan", "control")
 
@@ -123,7 +122,7 @@ def info(
     facts["notes_added"] = [note.text for note in added if note.text]
     facts["tags"] = list(dict.fromkeys(tag for note in added for tag in note.tags))
     recorded_figures = of_text(outcome)
-    told = Facts(facts | {key: value for key, value in recorded_figures.items() if key not in (*facts, *_REPEATED)})
+    told = Facts(facts | {key: value for key, value in recorded_figures.items() if key not in (*facts, "reason")})
     told.path, told.topics, told.columns = path, session.topics, {}
     if tables:
         from flowrec.store import columns_of

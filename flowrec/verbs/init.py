@@ -185,7 +185,7 @@ def init(
 
 @contextmanager
 def _kept_on_success(picture: Path | None) -> Iterator[None]:
-    """Remove the picture of a camera where no configuration was written that tells of it."""
+    """Remove the picture of a camera unless the configuration that names it is written."""
     try:
         yield
     except BaseException:
@@ -261,7 +261,7 @@ def _questions(subject: _Subject) -> dict[str, str]:
     if config.rig == "lab":
         keys += [key for key in not_measured(config) if key not in _OPTIONS]
         if not config.mission.observes:
-            # A current that the coils do not bear must be nobody's default.
+            # A default must not be a current that the coils do not bear.
             of_coils = (*_ASKED_OF_COILS.get(config.lab.amplifier, ()), "coils.max_current_a")
             keys += [key for key in of_coils if key not in subject.sets]
     rows = {row.key: row for row in setting_rows()}

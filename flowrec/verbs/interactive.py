@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flowrec.run import DiskMonitor, Watchdog
     from flowrec.store import SessionWriter
 
-_PERIOD_S = 0.12
+_PERIOD_S = 0.12  # of the status line: faster ones can not be read
 _CLOSE_TIMEOUT_S = 0.3  # for the last events to be shown
 _EVENTS_LIMIT = 1000  # that wait to be shown
 _COLOURS: dict[str, str] = {Level.WARNING: "yellow", Level.ERROR: "red"}
@@ -182,7 +182,7 @@ class StatusLine:
         latency = np.percentile(latencies, [50, 99]) if latencies else (0.0, 0.0)
         queue_mb, drops = (timing.queue_mb, timing.dropped_frames) if timing is not None else (0.0, 0)
         error = tick.demand.error_um if tick.demand is not None else float("nan")
-        # In the order of their worth: what does not fit into the line is left out from the end.
+        # The most important first: what does not fit into the line is left out from the end.
         every = [
             "HELD" if mission is not None and mission.held_since_ns is not None else "",
             f"{phase}{wait}",

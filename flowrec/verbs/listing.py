@@ -61,7 +61,7 @@ def runs_of(files: Iterable[Path]) -> dict[Path, list[Path]]:
     for path in sorted(named):
         run = path
         if ".part" in path.name and part_number(path):
-            # Beside a file of that name the parts are not what opens under it: each is a session of its own.
+            # Where there is a file of that name, it is what opens under it, and each part is a session of its own.
             run = run_path(path) if run_path(path) not in named else path
         rows.setdefault(run, []).append(path)
     return rows

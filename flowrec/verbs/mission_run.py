@@ -98,8 +98,8 @@ def run_mission(
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
     inputs : files that were read besides those that `config` names; no output may be one of them.
     console : serve a page on this machine that shows the run and steers it.
-    looked : of an import, what the movie has shown before. It can be done again: one that ends by an exception leaves
-        no file, and one that it was to replace stays.
+    looked : what the movie has shown, of an import. An import can be repeated: one that ends by an exception leaves
+        no file, and the file that it was to replace stays.
     log : values of this program, which are recorded beside the run.
     """
     if console:

@@ -41,7 +41,7 @@ def readable_toml(file: Path | None) -> Path | None:
 
 
 def known_session(named: Path) -> Path:
-    """Return the path; refuse a session that is not there, before imports that take longer than all else of that."""
+    """Return the path; refuse a session that is not there before the imports, which take longer than to look."""
     from flowrec.store import existing_session
 
     return existing_session(named)

@@ -8,7 +8,6 @@ ran; that is told as every other difference is, with the option that leaves it o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from heapq import merge
 from itertools import groupby, repeat
@@ -220,7 +219,7 @@ def _same_bytes(first: Session, second: Session) -> int | None:
     if sizes[0] != sizes[1]:
         return None
     for one, other in zip(*files, strict=True):
-        with closing(open_bytes(one)) as here, closing(open_bytes(other)) as there:
+        with open_bytes(one) as here, open_bytes(other) as there:
             for offset in range(0, here.size, _BLOCK_BYTES):
                 length = min(_BLOCK_BYTES, here.size - offset)
                 if here.read(offset, length) != there.read(offset, length):

@@ -106,10 +106,11 @@ def watch(path: Path | None, mode: Literal["spawn", "serve"], *, console: bool =
         path = runs[0].path
     run = GrowingRun(path)
     obey = RemoteControl(run.path).obey if console else None
-    remarks = {"duration_s": run.config.duration_s}
+    config = run.header.config(f"{run.path}: config.toml inside")
+    remarks = {"duration_s": config.duration_s}
     last = Tick()
     ended = RunEnded("this page was closed; the run goes on", good=True)
-    shown = Watching(mode, (run.config, run.chip, run.path), obey, lambda: remarks)
+    shown = Watching(mode, (config, run.header.chip(), run.path), obey, lambda: remarks)
     try:
         say(f"{run.path}: Ctrl-C ends the view, not the run")
         for tick in run.ticks():

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import NS_PER_S, Floats, Image
+from flowrec.core import NS_PER_S, Floats, Floats32, Image
 from flowrec.store import nonzero_window
 from flowrec.view.colours import SOLID, Rgb
 
@@ -104,13 +104,13 @@ class Layer:
             self._mix(mask, shade, opacity)
 
     def blend(self, grey: NDArray[np.uint8], picture: Picture) -> None:
-        """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it; nothing is drawn after it."""
+        """Draw the lines in a picture (h, w, 3) of an image (h, w); no line is added afterwards."""
         where, ink = self._finished
         levels = grey.reshape(-1, 1)[where]
         picture.reshape(-1, 3)[where] = (levels * (1.0 - ink[:, 3:]) + ink[:, :3] + 0.5).astype(np.uint8)
 
     @functools.cached_property
-    def _finished(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    def _finished(self) -> tuple[NDArray[np.intp], Floats32]:
         """Places of the pixels that have lines, and their ink."""
         where = np.flatnonzero(self._ink[..., 3])
         return where, self._ink.reshape(-1, 4)[where]

@@ -14,16 +14,15 @@ import sys
 import tempfile
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from flowrec.core import Frame, Tick, start_child
+from flowrec.core import Closing, Frame, Tick, start_child
 from flowrec.view.viewer import last_line, leave, until
 
 _QUEUE_TICKS = 600  # without images: small
@@ -194,7 +193,7 @@ class Feed:
         return Batch(step, changes, self._remarks()), sent
 
 
-class FeedSink(ABC):
+class FeedSink(Closing):
     """A sink that hands ticks to a process, if that has started.
 
     Whatever happens to the process, `write` neither waits nor raises.
@@ -228,16 +227,6 @@ class FeedSink(ABC):
             return False
         leave(feed.process)
         return True
-
-    @abstractmethod
-    def close(self) -> None:
-        """End the process within a time limit."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
 
 def read_feed() -> Iterator[Any]:

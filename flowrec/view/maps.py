@@ -13,7 +13,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from flowrec.core import Bools, Floats, FlowField, Matrix, Route, Tick
+from flowrec.core import Bools, Floats, Floats32, FlowField, Matrix, Route, Tick
 from flowrec.view import colours, flow_values
 from flowrec.view import entities as e
 from flowrec.view.colours import ColourScale
@@ -39,7 +39,7 @@ class SpeedScale:
             self.scale = ColourScale.up_to(peak_um_s, "speed")
 
 
-def wave_fronts(time_s: NDArray[np.float32], mask: Bools, scale: ColourScale) -> rr.EncodedImage:
+def wave_fronts(time_s: Floats32, mask: Bools, scale: ColourScale) -> rr.EncodedImage:
     """A time to go (h, w) with darker isochrones, two for each tick; red where the goal can not be reached."""
     time_s = np.where(mask & np.isfinite(time_s), time_s, np.nan)
     pixels = scale.paint(time_s)

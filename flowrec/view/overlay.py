@@ -152,7 +152,7 @@ def _content_key(tick: Tick) -> tuple[object, ...]:
 
 
 def _sparser(points_um: Floats, spacing_um: float) -> tuple[Floats, float]:
-    """Every point of a grid, first come first served, that is far enough from those before; and their spacing."""
+    """Points of a grid, in its order, each far enough from those taken before; and their spacing."""
     spacing_um *= _SPARSER
     chosen: list[Floats] = []
     for point in points_um:

@@ -58,7 +58,7 @@ def write_rrd(
 
 
 def _flush(stream: rr.RecordingStream, path: Path) -> None:
-    """Wait for as long as the file grows: where Rerun's thread could not write, its own wait may never end."""
+    """Wait while the file grows: Rerun's own wait may never end if its thread could not write."""
     written = -1
     while (size := path.stat().st_size) != written:
         written = size

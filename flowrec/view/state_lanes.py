@@ -32,10 +32,7 @@ _NONE = ""  # a state that is not drawn
 
 
 class StateLogger:
-    """Logs the timeline of states: mission, sight of the robot, alarms, marks and losses of images.
-
-    Only changes are logged; a lane that never had a state is not logged.
-    """
+    """Logs the lanes of one session: only changes, and no lane that never had a state."""
 
     def __init__(self, entities: EntityLogger, *, doubtful: bool) -> None:
         self._log = entities.log

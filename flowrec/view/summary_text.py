@@ -110,7 +110,7 @@ def note_of(figures: Mapping[str, Value], whose: str = "") -> str:
 class LiveSummary:
     """Summary panel of a run that is under way; at its end it states what the panel of its session states.
 
-    But for the shortest way, which is planned after the end.
+    Only the shortest way is missing, which is planned after the end.
     """
 
     def __init__(self, scene: Scene) -> None:

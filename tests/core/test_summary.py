@@ -12,6 +12,7 @@ import pytest
 
 from flowrec.core import Value, of_text, verdict_lines, way_text, with_micro
 from flowrec.store import Session, SessionReader
+from flowrec.store.older_files import outcome_of_today
 from tests.conftest import run
 from tests.short_missions import SMALL
 
@@ -93,6 +94,8 @@ def test_a_replay_gives_numbers_before_and_after(told, tmp_path: Path) -> None: 
 def test_an_older_file_that_holds_sentences_is_still_read(told) -> None:  # type: ignore[no-untyped-def]
     facts = json.loads(told("info", GOLDEN, "--json"))["facts"]
     assert facts.get("assumed_flow_error") == 0.127
+    assert facts["refined_method"] == "assimilate"
+    assert "duration" not in facts
     assert facts["tracking_error"] == "22.6 um rms"
     assert facts["seed"] == 5
     assert facts["commit"].startswith("7bf8e22119")
@@ -117,8 +120,10 @@ def test_a_new_file_holds_the_count_of_dropped_frames_once_and_readers_take_the_
     assert outcome["dropped_frames"] == "0"
     assert "frames_dropped" not in outcome
     assert Session(session).outcome["frames_dropped"] == 0
-    for older in ({"frames_dropped": "3"}, {"dropped_frames": "3"}, {"frames_dropped": "1", "dropped_frames": "3"}):
-        assert of_text(older) == {"frames_dropped": 3}
+    for older in ({"frames_dropped": "3"}, {"dropped_frames": "3"}, {"frames_dropped": "3", "dropped_frames": "1"}):
+        assert of_text(outcome_of_today(older)) == {"frames_dropped": 3}
+    for odd in ({"dropped_frames": "many"}, {"frames_dropped": "many", "dropped_frames": "1"}, {}):
+        assert outcome_of_today(odd) == {key: text for key, text in odd.items() if key == "dropped_frames"}
 
 
 def test_what_a_file_states_of_the_way_in_part_only_is_no_sentence() -> None:

@@ -28,7 +28,7 @@ from flowrec.store import FRAME_PATH, SLOTS
 from flowrec.store.channels import declarations
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.gathered_copies import gather
+from flowrec.store.lookup import gather
 from flowrec.store.mcap_format import ChannelIndex, SealedChunk
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.session_metadata import OUTCOME, PROFILE, header_records

@@ -50,7 +50,7 @@ def soak_run(minutes: float, folder: Path | None = None, settings: tuple[str, ..
             "status": run.returncode,
             "file_mb": path.stat().st_size / 1e6,
             "images": session.topics["/camera/frame"],
-            "dropped": outcome.get("frames_dropped", outcome.get("dropped_frames", 0)),
+            "dropped": outcome.get("frames_dropped", 0),
             "missing": outcome.get("frames_missing_from_camera", 0),
             "clocks": outcome.get("clocks", "not stated"),
             "wall_ppm": _drift_ppm(session),

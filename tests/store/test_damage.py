@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from flowrec.core import Currents, SessionError
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, file_reader, session_metadata
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, merged_chunks, session_metadata
 from flowrec.store.mcap_writer import McapWriter
 from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
@@ -323,7 +323,7 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_named(tmp_path, session
 
 def test_a_reading_that_is_abandoned_waits_for_no_thread_whichever_it_is_collected_in():
     def reading():
-        with file_reader._threads() as executor:
+        with merged_chunks.threads() as executor:
             yield executor
 
     busy, abandoned = threading.Event(), reading()

@@ -15,8 +15,7 @@ import flowrec
 from flowrec.core import UsageError
 from flowrec.store import is_copy, recover
 from flowrec.store.channels import SessionContents
-from flowrec.store.gathered_copies import GatheredCopies
-from flowrec.store.lookup_record import LOOKUP_OPCODE
+from flowrec.store.lookup import LOOKUP_OPCODE, GatheredCopies
 from flowrec.store.mcap_format import CRC, RECORD_HEAD
 from flowrec.store.mcap_reader import McapReader
 from tests.extras import needs

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 import flowrec
-from flowrec.store.session import card
+from flowrec.store.session_card import card
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 

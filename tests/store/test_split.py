@@ -139,6 +139,12 @@ def test_a_part_whose_beginning_is_larger_than_a_part_still_gets_as_much_again(t
     assert 2 < len(files) < len(TICKS) / 2
 
 
+def test_the_image_before_a_part_counts_to_its_beginning_and_not_to_what_it_adds(tmp_path):
+    ticks = list(ticks_of(12, shape=(400, 400)))  # an image is larger than head and state
+    files = record(tmp_path / "x.mcap", Split(megabytes=0.001), ticks=ticks, frames="raw", block=True).files
+    assert 3 < len(files) <= 1 + len(ticks) / 2
+
+
 def test_a_part_counts_the_images_that_still_wait_for_it_until_they_have_come(tmp_path):
     options = WriterOptions(files=Split(megabytes=0.2), frames="raw")
     parts = Parts(RecordingPlan(tmp_path / "x.mcap", HEADER, options, None, "run", {}), print)

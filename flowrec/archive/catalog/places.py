@@ -7,7 +7,6 @@ it, a thousand objects a request.
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import glob
 import hashlib
@@ -74,7 +73,7 @@ def _versions(place: UrlPath) -> Mapping[Path, str]:
     from flowrec.store import RemoteFile, is_listed, objects_in
 
     if not is_listed(place):
-        with contextlib.closing(RemoteFile(place)) as file:
+        with RemoteFile(place) as file:
             return {place: f"{file.size} {file.version}"}
     pattern = place.name if glob.has_magic(place.name) else ""
     single = not pattern and place.name.endswith((*NAMES, *PARQUET))

@@ -6,7 +6,6 @@ replays of the same session, 1 for the best, and `table`, the file.
 
 from __future__ import annotations
 
-import contextlib
 import io
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -71,7 +70,7 @@ def lists_of(contents: Sequence[str | None], rows: pa.Table) -> tuple[pa.ListArr
 
 def _read(path: Path) -> list[dict[str, Any]]:
     """The rows of the table of a sweep by column, with their settings as one text; none of another table."""
-    with contextlib.closing(open_bytes(path)) as source:
+    with open_bytes(path) as source:
         if source.size > _LIMIT_BYTES:
             raise SessionError(f"{path}: is larger than the table of a sweep")
         file = pq.ParquetFile(io.BytesIO(source.read(0, source.size)))

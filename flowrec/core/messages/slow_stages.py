@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from flowrec.core.declarations import NOT_STATED, Matrix, Message, Raster, Shape, Vector, message_fields
+from flowrec.core.declarations import NOT_STATED, Bools, Floats, Matrix, Message, Raster, Shape, Vector, message_fields
 from flowrec.core.errors import UsageError, needs
 from flowrec.core.units import seconds, unit_of
 
@@ -214,7 +214,7 @@ class FlowField(Message):
         return axes
 
 
-def values_of(field: FlowField, fluid: NDArray[np.bool_]) -> NDArray[np.float64]:
+def values_of(field: FlowField, fluid: Bools) -> Floats:
     """(n, 7) the columns VALUES, a row for each pixel of fluid (h, w); NaN where no standard deviation is stated."""
     rows, columns = np.nonzero(fluid)
     places = np.column_stack([columns, rows]) * field.um_per_px
@@ -222,14 +222,14 @@ def values_of(field: FlowField, fluid: NDArray[np.bool_]) -> NDArray[np.float64]
     return np.hstack([places, field.velocity_um_s[fluid], std, field.pressure_pa[fluid][:, None]])
 
 
-def fluid_of(field: FlowField) -> NDArray[np.bool_]:
+def fluid_of(field: FlowField) -> Bools:
     """(h, w) where a field has fluid; of a field that does not state its walls, where it flows."""
     if field.wall_px is not None:
         return field.wall_px > 0
     return np.any(field.velocity_um_s != 0, axis=-1)
 
 
-def _arrows(axes: Axes, field: FlowField, fluid: NDArray[np.bool_]) -> None:
+def _arrows(axes: Axes, field: FlowField, fluid: Bools) -> None:
     step = max(1, max(fluid.shape) // _ARROWS)
     rows, columns = np.mgrid[step // 2 : fluid.shape[0] : step, step // 2 : fluid.shape[1] : step]
     inside = fluid[rows, columns]

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.declarations import NOT_STATED, Matrix, Message, Shape, Vector
+from flowrec.core.declarations import NOT_STATED, Ints, Matrix, Message, Shape, Vector
 
 SAMPLES, STREAMS, PUMP = "/streams/samples", "/streams/state", "/flow/pump"  # paths of the topics
 BY_STREAM = "stream "  # the text of an operator's event that a stream has caused begins so
@@ -27,7 +27,7 @@ class Samples(Message):
     channel: Annotated[
         NDArray[np.int32], "array", Shape("n"), "place of the channel in StreamStates.channels, the first is 0"
     ]
-    sample_ns: Annotated[NDArray[np.int64], "array", Shape("n"), "when it was taken, on the session clock"]
+    sample_ns: Annotated[Ints, "array", Shape("n"), "when it was taken, on the session clock"]
     value: Annotated[Matrix, Shape("n", finite=False), "in the unit of the channel"]
     latest: Annotated[
         Vector, Shape("m", finite=False), "latest value of each channel so far, for plots; NaN before the first"
@@ -43,13 +43,11 @@ class StreamStates(Message):
     channels: Annotated[str, "all channels as stream/channel, a line each"]
     units: Annotated[str, "unit of each channel, a line each; empty where nobody states it"]
     state: Annotated[NDArray[np.int32], "array", Shape("s"), "0: nothing has come yet, 1: it comes, 2: it is silent"]
-    samples: Annotated[NDArray[np.int64], "array", Shape("s"), "samples so far, each with all channels of its stream"]
-    lost: Annotated[NDArray[np.int64], "array", Shape("s"), "samples thrown away by the queue before the loop, so far"]
-    missing: Annotated[
-        NDArray[np.int64], "array", Shape("s"), "samples that gaps in the stamps of a regular stream tell of, so far"
-    ]
-    steps: Annotated[NDArray[np.int64], "array", Shape("s"), "steps of the sender's clock that were taken out, so far"]
-    restarts: Annotated[NDArray[np.int64], "array", Shape("s"), "how often the stream has come back, so far"]
+    samples: Annotated[Ints, "array", Shape("s"), "samples so far, each with all channels of its stream"]
+    lost: Annotated[Ints, "array", Shape("s"), "samples thrown away by the queue before the loop, so far"]
+    missing: Annotated[Ints, "array", Shape("s"), "samples that gaps in the stamps of a regular stream tell of, so far"]
+    steps: Annotated[Ints, "array", Shape("s"), "steps of the sender's clock that were taken out, so far"]
+    restarts: Annotated[Ints, "array", Shape("s"), "how often the stream has come back, so far"]
     correction_s: Annotated[
         Vector,
         Shape("s", finite=False),

@@ -15,8 +15,9 @@ import queue
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
+from flowrec.core.closing import Closing
 from flowrec.core.errors import FlowrecError, UsageError
 from flowrec.core.system.child_process import ChildEndedError, ChildProcess, Parent
 
@@ -25,7 +26,7 @@ Answer = TypeVar("Answer")
 MEMORY_BYTES = 3 << 30  # for one file, beyond what the libraries take
 
 
-class BoundedProcess:
+class BoundedProcess(Closing):
     """The child process; it is started by the first call, and ends with `close` or with this process.
 
     Parameters
@@ -79,12 +80,6 @@ class BoundedProcess:
         """End the child at once."""
         if self._child is not None:
             self._child.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def _start_child(self) -> ChildProcess:
         try:

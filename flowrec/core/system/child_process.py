@@ -18,7 +18,7 @@ from flowrec.core.system.processes import start_child
 
 _PRINTED_BYTES = 65_536  # the last part of what the process printed
 _LINE_LETTERS = 300  # of its last line
-_JOIN_S = 5.0
+_JOIN_S = 5.0  # for its threads, and for a process that has closed its pipe
 
 
 class ChildEndedError(Exception):

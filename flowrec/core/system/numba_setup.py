@@ -96,10 +96,10 @@ def keep_kernels() -> None:
             Path(folder, _COMPLETE).touch()
 
 
-def kernel_files(package: Path = _PACKAGE) -> list[Path]:
+def kernel_files() -> list[Path]:
     """The files of flowrec with kernels, and the one that compiles them."""
-    found = (path for path in package.rglob("*.py") if _DECORATED in path.read_text(encoding="utf-8"))
-    return sorted({package / _OWN, *found})
+    found = (path for path in _PACKAGE.rglob("*.py") if _DECORATED in path.read_text(encoding="utf-8"))
+    return sorted({_PACKAGE / _OWN, *found})
 
 
 @functools.cache

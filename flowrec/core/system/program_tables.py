@@ -23,7 +23,7 @@ _Columns = dict[str, NDArray[Any]]
 
 _MAT_5, _MAT_73, _XDF = b"MATLAB 5.0", b"MATLAB 7.3", b"XDF:"
 HEAD_BYTES = 16
-_CPU_S, _CPU_S_PER_MB = 20.0, 2.0
+_CPU_S, _CPU_S_PER_MB = 20.0, 2.0  # limit of the process that reads a file
 _LARGEST_MATRIX = 64  # columns; what has more is an image
 _LIMIT_ROWS = 1 << 23
 _OF_MATLAB = "vectors of equal length, as in save('log.mat', 'time_s', 'frequency_hz', 'heading_deg', 'amplitude_mt')"

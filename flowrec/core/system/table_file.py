@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowrec.core.declarations import Floats
 from flowrec.core.errors import UsageError
 from flowrec.core.system.bounded_process import BoundedProcess
 from flowrec.core.system.program_tables import HEAD_BYTES, program_of, program_rows
@@ -57,14 +57,14 @@ class Table:
             raise UsageError(f"{self.where}: two columns are named {name}; rename one")
         return places[0] if places else None
 
-    def numbers(self, name: str) -> NDArray[np.float64]:
+    def numbers(self, name: str) -> Floats:
         """(n,) the numbers of a column.
 
         Raises UsageError: no such column; an empty cell, NaN, or what is no number, with its line.
         """
         return self._values(name, dates=False)
 
-    def times_s(self, name: str | None = None) -> tuple[str, NDArray[np.float64]] | None:
+    def times_s(self, name: str | None = None) -> tuple[str, Floats] | None:
         """The column of times, and its times (n,) in s. None: there is none.
 
         Dates (ISO 8601, or of Excel) count from 1970 in UTC, unless they state an offset; times of day from midnight.
@@ -77,7 +77,7 @@ class Table:
             return None
         return found, self._values(found, dates=True) * TIME_UNITS.get(_plain(found), 1.0)
 
-    def _values(self, name: str, *, dates: bool) -> NDArray[np.float64]:
+    def _values(self, name: str, *, dates: bool) -> Floats:
         place = self.index(name)
         if place is None:
             raise UsageError(f"{self.where}: no column {name}; its columns are {', '.join(self.header)}")

@@ -14,7 +14,7 @@ from flowrec.physics.chip.fluid import ViscosityLaw, ViscositySettings
 Side = Literal["left", "right", "top", "bottom"]
 Kind = Literal["inlet", "outlet"]
 Walls = Literal["smooth", "pixel"]
-WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
+WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0  # at 20 degrees C, to 0.2 %
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ import functools
 import cv2
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from flowrec.core import Bools, ChipError, Floats
+from flowrec.core import Bools, ChipError, Floats, Floats32
 from flowrec.physics.chip.chip import Chip
 from flowrec.physics.chip.openings import border, named_opening
 
@@ -17,7 +17,7 @@ _KEPT = 8  # masks of which the distances are kept: an assimilation asks for tho
 _PAD_PX = 16  # by which a channel goes on straight beyond the border
 
 
-def clearance_um(mask: Bools, um_per_px: float) -> NDArray[np.float32]:
+def clearance_um(mask: Bools, um_per_px: float) -> Floats32:
     """Signed distance (h, w) in um from each pixel centre to the nearest wall, negative in solid.
 
     The wall lies half way between the centres of a fluid and a solid pixel: exact for walls along the pixels, up to

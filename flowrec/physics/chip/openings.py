@@ -24,7 +24,7 @@ from flowrec.physics.chip.chip import Chip, Kind, Opening, Side
 SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
 CHIP_NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um")  # of a chip; the depth may be None
 MIN_SIDE_PX, MIN_OPENING_PX = 8, 3
-DEFAULT_INLET_UM_S = 200.0
+DEFAULT_INLET_UM_S = 200.0  # mean speed at an inlet that no file states
 
 
 def border(image: NDArray[Any], side: Side) -> NDArray[Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Bools, Floats, FlowError, Ints
+from flowrec.core import Bools, Floats, Floats32, FlowError, Ints
 from flowrec.physics.chip.chip import Chip, Kind, Opening, Side
 from flowrec.physics.chip.openings import SIDES, border
 from flowrec.physics.flow.assembly import components
@@ -83,7 +83,7 @@ class Grid:
         return np.concatenate([upright[self.u.number >= 0], level[self.v.number >= 0]])
 
     @property
-    def wall_px(self) -> NDArray[np.float32]:
+    def wall_px(self) -> Floats32:
         """Signed distance (h, w) of the pixel centres to the wall, as in FlowField."""
         return self.walls.at_centres(self.k)
 

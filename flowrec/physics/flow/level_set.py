@@ -10,7 +10,7 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import Bools, Floats, Ints
+from flowrec.core import Bools, Floats, Floats32, Ints
 from flowrec.physics.chip.chip import Walls
 from flowrec.physics.flow.contour_smoothing import contour_segments
 
@@ -38,7 +38,7 @@ class LevelSet:
         """The walls with rows and columns exchanged."""
         return LevelSet(self.level.T, self.staircase)
 
-    def at_centres(self, k: int) -> NDArray[np.float32]:
+    def at_centres(self, k: int) -> Floats32:
         """Level (h, w) at the centres of pixels of k x k subcells, not beyond FARTHEST_PX."""
         return np.clip(self.level[k :: 2 * k, k :: 2 * k], -FARTHEST_PX, FARTHEST_PX).astype(np.float32)
 

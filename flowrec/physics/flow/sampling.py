@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import Bools, Floats, FlowError, FlowField, compiled
+from flowrec.core import Bools, Floats, Floats32, FlowError, FlowField, compiled
 from flowrec.physics.chip.registration import on_chip
 from flowrec.physics.flow.velocity_stencil import velocities_at, velocity_at
 
@@ -47,8 +47,8 @@ def sample_as_seen(field: FlowField, points_um: ArrayLike) -> Floats:
 class MapRaster(NamedTuple):
     """A flow field, or none, as the kernels of the control loop take it."""
 
-    velocity_um_s: NDArray[np.float32]  # (h, w, 2); of no pixels without a field
-    wall_px: NDArray[np.float32]
+    velocity_um_s: Floats32  # (h, w, 2); of no pixels without a field
+    wall_px: Floats32
     um_per_px: float
     registration: Floats  # (2, 3)
 
@@ -63,8 +63,8 @@ class MapRaster(NamedTuple):
 
 @compiled
 def raster_velocity(
-    velocity: NDArray[np.float32],
-    wall_px: NDArray[np.float32],
+    velocity: Floats32,
+    wall_px: Floats32,
     um_per_px: float,
     registration: Floats,
     x_um: float,
@@ -82,7 +82,7 @@ def raster_velocity(
     return (yy * u - xy * v) / area, (xx * v - yx * u) / area
 
 
-def walls_of(field: FlowField) -> NDArray[np.float32]:
+def walls_of(field: FlowField) -> Floats32:
     """`wall_px` of a field for the kernels of velocity_stencil: of no pixels where the field is to be bilinear."""
     return field.wall_px if field.wall_px is not None and min(field.wall_px.shape) > 1 else _NO_WALLS
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import UM_PER_M, Floats
+from flowrec.core import UM_PER_M, Floats, Floats32
 from flowrec.physics.flow.assembly import averages
 from flowrec.physics.flow.generalised import GeneralisedSystem
 from flowrec.physics.flow.grid import Grid, GridOpening, number_where
@@ -56,7 +55,7 @@ class Sensitivities:
     law_unknowns: tuple[str, ...] = ()  # the last parameters
 
     @property
-    def wall_px(self) -> NDArray[np.float32]:
+    def wall_px(self) -> Floats32:
         """Signed distance (h, w) of the pixel centres to the wall, as in FlowField."""
         return self.equations.grid.wall_px
 

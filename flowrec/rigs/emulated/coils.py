@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import flowrec
-from flowrec.core import Floats, RigError
+from flowrec.core import Floats, Ints, RigError
 
 FIRMWARE = Path(flowrec.__file__).parent / "rigs/lab/amplifiers/firmware"
 SKETCH = FIRMWARE / "flowrec_coils/flowrec_coils.ino"
@@ -48,7 +47,7 @@ class OutputSamples:
         """The byte of the file from which on the samples to come are."""
         return self.file.stat().st_size // self.sample_bytes * self.sample_bytes
 
-    def outputs(self, from_byte: int = 0) -> tuple[NDArray[np.int64], Floats]:
+    def outputs(self, from_byte: int = 0) -> tuple[Ints, Floats]:
         """(n,) times on CLOCK_MONOTONIC in ns, and (n, coils) currents in A from each time on."""
         with self.file.open("rb") as stream:
             stream.seek(from_byte)

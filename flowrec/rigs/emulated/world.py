@@ -12,13 +12,24 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, FlowField, Image, Priority, RigError, Truth, nanoseconds, realtime_priority, seconds
+from flowrec.core import (
+    NS_PER_S,
+    Floats,
+    FlowField,
+    Image,
+    Ints,
+    Priority,
+    RigError,
+    Truth,
+    nanoseconds,
+    realtime_priority,
+    seconds,
+)
 from flowrec.rigs.emulated.coils import OutputSamples
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.stages import Floats, Pipeline, ResolvedConfig
+from flowrec.stages import Pipeline, ResolvedConfig
 
 _LATE_NS = 5_000_000  # after a moment its samples are in the file
 _PIECE_NS = 25_000_000  # during which the robot rolls straight; shorter ones show the delays of a board as fast turns
@@ -63,7 +74,7 @@ class Rolled:
         self.turns = np.concatenate([self.turns[kept], turns])
         self._field = field[-1:]
 
-    def until(self, at_ns: NDArray[np.int64]) -> Floats:
+    def until(self, at_ns: Ints) -> Floats:
         """Turns (m, 2) until these times."""
         return np.stack([np.interp(at_ns, self.times_ns, self.turns[:, axis]) for axis in (0, 1)], axis=1)
 
@@ -95,7 +106,7 @@ class EmulatedWorld(SimulatedRig):
         """The flow in which the robot swims."""
         return self.true_world().field
 
-    def _advance(self, swimmers: Sequence[Swimmer], until_ns: int) -> NDArray[np.float64]:
+    def _advance(self, swimmers: Sequence[Swimmer], until_ns: int) -> Floats:
         time.sleep(max(0.0, seconds(self.began_ns + until_ns + _LATE_NS - time.monotonic_ns())))
         rolled = self.rolled
         rolled.take()

@@ -5,12 +5,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Frame, MovieError, UsageError, nanoseconds, seconds
+from flowrec.core import NS_PER_S, Closing, Frame, Ints, MovieError, UsageError, nanoseconds, seconds
 from flowrec.movies import Movie, MovieFacts, ReadOptions, frame_times, open_movie
 from flowrec.stages import Coils, FieldLog, MovieSettings, is_of_session, read_coil_log
 
@@ -24,7 +22,7 @@ def open_source(settings: MovieSettings) -> Movie:
     return open_movie(Path(settings.path), settings.reader, options)
 
 
-class MovieSource:
+class MovieSource(Closing):
     """The images of a movie with session stamps, and what the coils were told on the same clock.
 
     A session stamp is clock_rate times the time since the first image, by the movie's clock. The log shows at that
@@ -144,13 +142,7 @@ class MovieSource:
         """Release the files."""
         self._movie.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def _stamps(self, times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _stamps(self, times_ns: Ints) -> Ints:
         """Session stamps of times on the movie's clock."""
         since, rate = times_ns - self.first_ns, self._settings.clock_rate
         return since if rate == 1.0 else np.rint(since * rate).astype(np.int64)

@@ -16,9 +16,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Floats, FlowField, TracerTruth
+from flowrec.core import Floats, Floats32, FlowField, TracerTruth
 from flowrec.physics import Chip, median_width_um, walls_of
 from flowrec.rigs.simulated.bodies import carry, entry_um
 from flowrec.rigs.simulated.pump import Pump
@@ -49,7 +48,7 @@ class Beads:
         robot_radius_um: float,
         depth_um: float | None,
         field: FlowField,
-        clearance_um: NDArray[np.float32],
+        clearance_um: Floats32,
         pump: Pump,
     ) -> None:
         count = simulated.tracers

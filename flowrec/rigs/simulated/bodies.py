@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import UM_PER_M, FlowField, bilinear, compiled
+from flowrec.core import UM_PER_M, Bools, Floats, Floats32, FlowField, bilinear, compiled
 from flowrec.physics import Chip, Opening, Robot, sample, velocity_at, walls_of
 from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Hindrance, hindered_velocity
 from flowrec.rigs.simulated.pump import Pump
@@ -32,14 +31,14 @@ def _moves(
     y: float,
     own_x: float,
     own_y: float,
-    velocity: NDArray[np.float32],
-    wall_px: NDArray[np.float32],
+    velocity: Floats32,
+    wall_px: Floats32,
     strength: float,
-    clearance: NDArray[np.float32],
+    clearance: Floats32,
     um_per_px: float,
     radius: float,
     hindrance: float,
-    walls: NDArray[np.float32],
+    walls: Floats32,
 ) -> tuple[float, float]:
     """Velocity of the robot at (x, y) um."""
     if hindrance == 0.0:
@@ -61,15 +60,15 @@ def _swim(
     own_x: float,
     own_y: float,
     dt: float,
-    noise: NDArray[np.float64],
-    velocity: NDArray[np.float32],
-    wall_px: NDArray[np.float32],
+    noise: Floats,
+    velocity: Floats32,
+    wall_px: Floats32,
     strength: float,
-    clearance: NDArray[np.float32],
+    clearance: Floats32,
     um_per_px: float,
     radius: float,
     hindrance: float,
-    walls: NDArray[np.float32],
+    walls: Floats32,
 ) -> tuple[float, float, int, float]:
     """Advance by len(noise) midpoint steps of dt. Returns x, y (um), steps that touched a wall, last clearance."""
     touched = 0
@@ -121,7 +120,7 @@ class Swimmer:
         robot: Robot,
         simulated: Simulated,
         field: FlowField,
-        clearance_um: NDArray[np.float32],
+        clearance_um: Floats32,
         um_per_px: float,
         pump: Pump | None = None,
         hindrance: Hindrance = NO_HINDRANCE,
@@ -149,7 +148,7 @@ class Swimmer:
         self._run(0.0, 0.0, 0.0, np.zeros((0, 2)))  # compiles, so that the second frame is not late
 
     @property
-    def flow_um_s(self) -> NDArray[np.float64]:
+    def flow_um_s(self) -> Floats:
         """(2,) true flow at the centre; zero after it has left the chip."""
         if self.gone:
             return np.zeros(2)
@@ -193,7 +192,7 @@ class Swimmer:
         column, row = self.position_um / self._um_per_px
         self.gone = not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5)
 
-    def _run(self, own_x: float, own_y: float, dt: float, noise: NDArray[np.float64]) -> tuple[int, float]:
+    def _run(self, own_x: float, own_y: float, dt: float, noise: Floats) -> tuple[int, float]:
         x, y, touched, free = _swim(
             float(self.position_um[0]),
             float(self.position_um[1]),
@@ -216,14 +215,14 @@ class Swimmer:
 
 @compiled
 def carry(
-    points: NDArray[np.float64],
-    share: NDArray[np.float64],
-    velocity: NDArray[np.float32],
-    wall_px: NDArray[np.float32],
-    clearance: NDArray[np.float32],
+    points: Floats,
+    share: Floats,
+    velocity: Floats32,
+    wall_px: Floats32,
+    clearance: Floats32,
     um_per_px: float,
     dt: float,
-    lost: NDArray[np.bool_],
+    lost: Bools,
 ) -> None:
     """Move points (n, 2) in um with shares (n,) of the flow by dt, in two steps; `lost` (n,): outside the fluid."""
     height, width = clearance.shape
@@ -246,7 +245,7 @@ class Debris:
         count: int,
         robot_radius_um: float,
         field: FlowField,
-        clearance_um: NDArray[np.float32],
+        clearance_um: Floats32,
         seed: int,
     ) -> None:
         self._rng = np.random.default_rng([seed, 2])
@@ -285,7 +284,7 @@ class Debris:
             self.points_um[n] = entry_um(self._chip, self._inlets, self._rng)
 
 
-def entry_um(chip: Chip, inlets: list[Opening], rng: np.random.Generator) -> NDArray[np.float64]:
+def entry_um(chip: Chip, inlets: list[Opening], rng: np.random.Generator) -> Floats:
     """A drawn place (2,) at which a particle comes in: more enter where the inflow is faster."""
     inlet = inlets[int(rng.integers(len(inlets)))]
     # The mean of three uniform draws is nearly a parabola.

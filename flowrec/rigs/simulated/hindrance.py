@@ -40,7 +40,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import bilinear, compiled
+from flowrec.core import Floats, Floats32, bilinear, compiled
 
 FLOOR_DRAG = 2.9  # of the roller over its floor, relative to Stokes' drag
 FAXEN = math.sqrt(2.0 / 3.0)  # radii from the centre to the four points
@@ -101,7 +101,7 @@ def hindered_velocity(
     y: float,
     own_x: float,
     own_y: float,
-    flow: NDArray[np.float64],
+    flow: Floats,
     share: float,
     clearance: Rasters,
     walls: Rasters,
@@ -149,7 +149,7 @@ class Hindrance:
 NO_HINDRANCE = Hindrance(0.0, np.zeros((3, 0, 0), np.float32))
 
 
-def walls_around(clearance_um: NDArray[np.float32], um_per_px: float) -> Rasters:
+def walls_around(clearance_um: Floats32, um_per_px: float) -> Rasters:
     """(3, h, w): from wall to wall through a pixel, um, along its normal; cosine and sine of twice the normal's angle.
 
     `clearance_um` (h, w) is the distance of pixel centres to the nearest wall. In the middle of a channel, where that

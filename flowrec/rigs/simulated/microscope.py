@@ -21,7 +21,7 @@ import numpy as np
 import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, Image, compiled, pixel_type
+from flowrec.core import Bools, Floats, Floats32, Image, Ints, compiled, pixel_type
 from flowrec.physics import Calibration, clearance_um
 from flowrec.stages import CameraSettings, Optics, SimulatedImage
 
@@ -32,7 +32,7 @@ _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
 
 @compiled
 def _draw(
-    scene: NDArray[np.float32],
+    scene: Floats32,
     column: float,
     row: float,
     radius: float,
@@ -80,9 +80,9 @@ def _draw(
 
 @compiled
 def _expose(
-    scene: NDArray[np.float32],
+    scene: Floats32,
     pool: NDArray[np.int8],
-    offsets: NDArray[np.int64],
+    offsets: Ints,
     shot: float,
     read: float,
     top: int,
@@ -125,7 +125,7 @@ class Microscope:
 
     def __init__(
         self,
-        mask: NDArray[np.bool_],
+        mask: Bools,
         um_per_px: float,
         calibration: Calibration,
         camera: CameraSettings,
@@ -146,20 +146,20 @@ class Microscope:
         )
         self._scene = self._empty.copy()
 
-    def add_still(self, point_um: NDArray[np.float64], radius_um: float, darkness: float) -> None:
+    def add_still(self, point_um: Floats, radius_um: float, darkness: float) -> None:
         """Put a particle that never moves into the background."""
         self._particle(self._empty, self._calibration.to_px(point_um).tolist(), radius_um, darkness)
         self._scene[:] = self._empty
 
     def image(
         self,
-        robot_um: NDArray[np.float64] | None,
+        robot_um: Floats | None,
         robot_radius_um: float,
-        robot_velocity_um_s: NDArray[np.float64],
-        debris_um: NDArray[np.float64],
-        debris_radii_um: NDArray[np.float64],
-        debris_darkness: NDArray[np.float64],
-        stage_um: NDArray[np.float64] | None = None,
+        robot_velocity_um_s: Floats,
+        debris_um: Floats,
+        debris_radii_um: Floats,
+        debris_darkness: Floats,
+        stage_um: Floats | None = None,
         others: Sequence[DrawnRobot] = (),
     ) -> Image:
         """One frame (h, w): the robot (None: not there) over the debris (n, 2), at the middle of the exposure.
@@ -204,7 +204,7 @@ class Microscope:
 
     def _particle(
         self,
-        scene: NDArray[np.float32],
+        scene: Floats32,
         place_px: Sequence[float],
         radius_um: float,
         darkness: float,
@@ -217,14 +217,14 @@ class Microscope:
 
 
 def _empty_scene(
-    mask: NDArray[np.bool_],
+    mask: Bools,
     um_per_px: float,
     calibration: Calibration,
     shape: tuple[int, int],
     settings: SimulatedImage,
     rng: np.random.Generator,
     mask_origin_um: float,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Grey levels (h, w) = `shape` of the chip without particles."""
     height, width = shape
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
@@ -238,7 +238,7 @@ def _empty_scene(
     line = max(min(9.0, 0.45 * um_per_px), 1.1 * calibration.um_per_px)
     s = distance / line
 
-    def stripe(at: float, half_width: float) -> NDArray[np.float32]:
+    def stripe(at: float, half_width: float) -> Floats32:
         return np.asarray(np.exp(-(((s - at) / half_width) ** 2)), np.float32)
 
     solid = 1.0 / (1.0 + np.exp(np.clip(4.0 * (s + 0.5), -40, 40)))
@@ -263,7 +263,7 @@ def _empty_scene(
     return np.ascontiguousarray(np.clip(scene, 0.0, 255.0), np.float32)
 
 
-def outline_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def outline_px(mask: Bools) -> Floats32:
     """Signed distance (h, w) in pixels to a smooth outline behind the pixels of a mask, true within three pixels of it.
 
     The half level of the blurred mask, as in the solver's smooth walls: a blurred straight edge is a Gaussian
@@ -278,7 +278,7 @@ def outline_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.asarray((1.0 - weight) * near + weight * far, np.float32)
 
 
-def blotches(rng: np.random.Generator, height: int, width: int, size_px: float) -> NDArray[np.float32]:
+def blotches(rng: np.random.Generator, height: int, width: int, size_px: float) -> Floats32:
     """Smooth noise (h, w) of unit variance and a given size of its spots."""
     step = max(size_px / 2.0, 1.0)
     shape = (math.ceil(height / step) + 4, math.ceil(width / step) + 4)

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Truth
+from flowrec.core import Floats32, Truth
 from flowrec.physics import Chip, Robot
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.microscope import DrawnRobot
@@ -99,7 +98,7 @@ def other_robots(
     robot: Robot,
     simulated: Simulated,
     start_um: tuple[float, float],
-    clearance_um: NDArray[np.float32],
+    clearance_um: Floats32,
     **options: Any,
 ) -> list[OtherRobot]:
     """The other robots of a world, at their starts; `robot`, `start_um` are the first one's."""

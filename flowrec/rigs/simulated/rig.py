@@ -15,13 +15,14 @@ from dataclasses import replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flowrec.core import (
     NS_PER_S,
     Applied,
     Currents,
     DeviceClock,
+    Floats,
     FlowField,
     Frame,
     Image,
@@ -316,7 +317,7 @@ class SimulatedRig:
             self._world = world_of(self._chip, self._robot, self._simulated, self._given, clear_um)
         return self._world
 
-    def _advance(self, swimmers: Sequence[Swimmer], until_ns: int) -> NDArray[np.float64]:
+    def _advance(self, swimmers: Sequence[Swimmer], until_ns: int) -> Floats:
         """Advance the world to a stamp; the field changes exactly when commands take effect. Returns the turns (2,)."""
         turns = np.zeros(2)
         now = self._now_ns
@@ -336,7 +337,7 @@ class SimulatedRig:
                 return turns
             self._acting = self._coming.pop(0)[1]
 
-    def _turn(self, swimmers: Sequence[Swimmer], command: Currents, duration_s: float) -> NDArray[np.float64]:
+    def _turn(self, swimmers: Sequence[Swimmer], command: Currents, duration_s: float) -> Floats:
         """Let the field turn, and the robots with it, as control/field_rotation.py has it. Returns the turns (2,)."""
         way = field_motion(self._rotation, _order(command))
         self._rotation = way.after(duration_s)
@@ -366,7 +367,7 @@ class SimulatedRig:
         left_s = max(left_s, _STEADY_S) if rises else left_s - duration_s
         self._hold = (left_s, strength) if left_s > 0.0 else None
 
-    def _field_message(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
+    def _field_message(self, stamp_ns: int, turns: Floats) -> Applied:
         command, now = self._acting, self._rotation
         if command is None:
             return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(self._count), turns)

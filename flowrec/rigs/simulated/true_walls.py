@@ -15,7 +15,7 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import FlowField, RigError
+from flowrec.core import Floats, Floats32, FlowField, RigError
 from flowrec.physics import Chip, clearance_um, median_width_um, sample
 from flowrec.rigs.simulated.microscope import blotches, outline_px
 
@@ -34,7 +34,7 @@ Mask = NDArray[np.bool_]
 
 
 def true_walls(
-    chip: Chip, wall_error_px: float, blocked_share: float, clear_um: NDArray[np.float64], rng: np.random.Generator
+    chip: Chip, wall_error_px: float, blocked_share: float, clear_um: Floats, rng: np.random.Generator
 ) -> tuple[Chip, str]:
     """The chip with a mask (c h, c w) of its true walls, c = 2 or for large chips 1, and what was drawn, in words.
 
@@ -74,7 +74,7 @@ def true_walls(
     return replace(true, mask=np.ascontiguousarray(fluid)), ", ".join(words)
 
 
-def _ridge(inside: Mask) -> tuple[Mask, NDArray[np.float64]]:
+def _ridge(inside: Mask) -> tuple[Mask, Floats]:
     """The pixels in the middle between walls, and the distance (h, w) of every pixel to the nearest wall, in pixels.
 
     In the middle the distance has no slope, as in median_width_um.
@@ -102,7 +102,7 @@ def _without_specks(fluid: Mask, before: Mask) -> Mask:
     return fluid & ~_specks(fluid, before, None)
 
 
-def _specks(inside: Mask, before: Mask, neighbours: NDArray[np.float64] | None) -> Mask:
+def _specks(inside: Mask, before: Mask, neighbours: Floats | None) -> Mask:
     """The pixels of small pieces of `inside` whose pixels were in a piece of `before` of more than twice their size."""
     pieces, count = scipy.ndimage.label(inside, neighbours)
     whole, _ = scipy.ndimage.label(before, neighbours)
@@ -114,7 +114,7 @@ def _specks(inside: Mask, before: Mask, neighbours: NDArray[np.float64] | None) 
 
 
 def _obstacle(
-    true: Chip, origin: float, share: float, channel: float, clear_um: NDArray[np.float64], rng: np.random.Generator
+    true: Chip, origin: float, share: float, channel: float, clear_um: Floats, rng: np.random.Generator
 ) -> tuple[Mask, tuple[float, float]]:
     """The pixels of half an ellipse on one wall of a branch, and the place in um; `channel` is a width in pixels."""
     fluid = true.mask
@@ -174,7 +174,7 @@ def on_pixels(field: FlowField, true: Chip, chip: Chip) -> FlowField:
     )
 
 
-def at_centres(raster: NDArray[Any], chip: Chip) -> NDArray[np.float32]:
+def at_centres(raster: NDArray[Any], chip: Chip) -> Floats32:
     """A raster of the true mask at the centres of the chip's pixels (h, w): the mean of those within each."""
     height, width = chip.mask.shape
     cut = raster.shape[0] // height

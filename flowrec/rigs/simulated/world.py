@@ -10,9 +10,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import FlowError, FlowField, wrap_rad
+from flowrec.core import Bools, Floats, Floats32, FlowError, FlowField, wrap_rad
 from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, median_width_um, with_settings
 from flowrec.rigs.simulated.hindrance import NO_HINDRANCE, Hindrance, walls_around
 from flowrec.rigs.simulated.pump import Pump
@@ -137,7 +136,7 @@ def misregister(stated: Calibration, simulated: Simulated, size_px: tuple[int, i
 class Shake:
     """A swing of the stage."""
 
-    way_um: NDArray[np.float64]  # (2,) amplitude
+    way_um: Floats  # (2,) amplitude
     hz: float
     phase_rad: float
 
@@ -150,7 +149,7 @@ class Shake:
         angle, phase = drawn_from(simulated.seed, "shake").uniform(0.0, 2.0 * math.pi, 2)
         return cls(amplitude_um * np.array([math.cos(angle), math.sin(angle)]), simulated.value("shake_hz"), phase)
 
-    def at(self, time_s: float) -> NDArray[np.float64]:
+    def at(self, time_s: float) -> Floats:
         """(2,) um off at a time."""
         return self.way_um * math.sin(2.0 * math.pi * self.hz * time_s + self.phase_rad)
 
@@ -166,7 +165,7 @@ class TrueCoils:
     """
 
     coils: Coils  # as they are calibrated
-    made: NDArray[np.float64]  # (3, 3) M, from a commanded field to the true one
+    made: Floats  # (3, 3) M, from a commanded field to the true one
 
     @classmethod
     def of(cls, coils: Coils | None, simulated: Simulated) -> TrueCoils | None:
@@ -195,16 +194,14 @@ class World:
     """Flow and walls of a world on the pixels of the chip."""
 
     field: FlowField  # the steady flow; its note says what was drawn
-    clearance_um: NDArray[np.float32]  # (h, w) from pixel centres to the true walls
-    mask: NDArray[np.bool_]  # of the true walls, which the microscope shows
+    clearance_um: Floats32  # (h, w) from pixel centres to the true walls
+    mask: Bools  # of the true walls, which the microscope shows
     mask_um_per_px: float
     mask_origin_um: float  # where the centre of its first pixel lies, on either axis of the chip frame
     hindrance: Hindrance
 
 
-def world_of(
-    chip: Chip, robot: Robot, simulated: Simulated, field: FlowField | None, clear_um: NDArray[np.float64]
-) -> World:
+def world_of(chip: Chip, robot: Robot, simulated: Simulated, field: FlowField | None, clear_um: Floats) -> World:
     """The world of a seed. A given field keeps the chip's own walls.
 
     Parameters
@@ -215,7 +212,7 @@ def world_of(
     Raises FlowError, RigError if there is no such world.
     """
     mask, um_per_px, mask_origin_um = chip.mask, chip.um_per_px, 0.0
-    walls_um: NDArray[np.float32] | None = None
+    walls_um: Floats32 | None = None
     if field is None:
         solver = FlowSolver(k=simulated.value("k"))
         truth = true_chip(chip, simulated, solver, robot.radius_um)

@@ -12,14 +12,12 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Currents, Measured, RigError, UsageError, coil_names, seconds, wrap_rad
+from flowrec.core import Currents, Floats, Measured, RigError, UsageError, coil_names, seconds, wrap_rad
 from flowrec.physics import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.stages import Coils, FieldCommand, OutputLimits, field_limits
 
-_TURN_RAD = 2.0 * math.pi
 _ROUNDING = 1e-9  # relative
 
 
@@ -133,7 +131,7 @@ class CommandLimits:
         """Longest time that a field takes to go."""
         return self.amplitude_mt / self.off_ramp_mt_s
 
-    def check_samples(self, currents_a: NDArray[np.float64], voltages_v: NDArray[np.float64]) -> None:
+    def check_samples(self, currents_a: Floats, voltages_v: Floats) -> None:
         """Refuse output samples beyond a limit.
 
         Parameters
@@ -152,11 +150,9 @@ class CommandLimits:
             _refuse_beyond("slew", rate, self.output.slew_a_s, "A/s")
 
     @property
-    def _turning_a_s(self) -> NDArray[np.float64]:
+    def _turning_a_s(self) -> Floats:
         """(coils,) largest rate of change of the currents while the amplitude is constant."""
-        turning: NDArray[np.float64] = (
-            field_limits(self.coils).row_a_per_mt * self.amplitude_mt * _TURN_RAD * self.rotation_hz
-        )
+        turning: Floats = field_limits(self.coils).row_a_per_mt * self.amplitude_mt * math.tau * self.rotation_hz
         return turning
 
     def _permits(self, now_ns: int, wanted: bool) -> bool:
@@ -213,7 +209,7 @@ class ReadBack:
         )
 
 
-def _refuse_beyond(name: str, values: NDArray[np.float64], limit: float, unit: str) -> None:
+def _refuse_beyond(name: str, values: Floats, limit: float, unit: str) -> None:
     # A comparison with NaN is false, so this refuses NaN too. The tolerance is for rounding.
     if not (np.abs(values) <= limit * (1.0 + 1e-6)).all():
         worst = float(np.abs(values).max())

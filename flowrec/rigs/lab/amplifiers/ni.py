@@ -12,10 +12,8 @@ from multiprocessing import Pipe
 from typing import TYPE_CHECKING, Any, Self
 
 import nidaqmx  # noqa: F401  here, so that a missing package is stated before a process is started
-import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Measured, RigError, start_child
+from flowrec.core import NS_PER_S, Floats, Measured, RigError, start_child
 from flowrec.physics import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import KEEP_S, AmplifierInfo, not_before
 from flowrec.stages import Coils, FieldCommand, FieldLog, MotionSegment, OutputLimits
@@ -24,9 +22,9 @@ if TYPE_CHECKING:
     from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
 _START_S = 60.0  # the package of NI takes seconds to load on a busy computer, and so does a device
-_ZERO_S = 0.5
+_ZERO_S = 0.5  # time for the process to confirm zero
 _SILENT_S = 0.5  # a process that has written no block for so long is stuck
-_END_S = 5.0
+_END_S = 5.0  # time for the process to end by itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +48,7 @@ class Played:
     from_ns: int
     segments: tuple[MotionSegment, ...]
     amplitude_mt: float
-    currents_a: NDArray[np.float64]  # (n,) at the first sample
+    currents_a: Floats  # (n,) at the first sample
 
 
 class NiAmplifier:

@@ -13,9 +13,8 @@ from nidaqmx.constants import AcquisitionType, RegenerationMode
 from nidaqmx.errors import DaqError, DaqNotFoundError, DaqNotSupportedError, RpcError
 from nidaqmx.stream_readers import AnalogMultiChannelReader
 from nidaqmx.system import Device
-from numpy.typing import NDArray
 
-from flowrec.core import RigError, coil_names
+from flowrec.core import Floats, RigError, coil_names
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.stages import AmplifierSettings
 
@@ -91,7 +90,7 @@ class NiDevice:
         self._task.start()
         return (before_ns + time.monotonic_ns()) // 2
 
-    def write(self, voltages_v: NDArray[np.float64]) -> None:
+    def write(self, voltages_v: Floats) -> None:
         """Append samples (n, coils)."""
         assert self._task is not None
         self._task.write(np.ascontiguousarray(voltages_v.T), auto_start=False)
@@ -174,7 +173,7 @@ class NiInputs:
     RigError : no such inputs, or not one a coil; one line.
     """
 
-    def __init__(self, channels: str, server: str, volts_per_a: NDArray[np.float64], coils: int) -> None:
+    def __init__(self, channels: str, server: str, volts_per_a: Floats, coils: int) -> None:
         if volts_per_a.size not in (1, coils):
             raise RigError(
                 f"lab.ni.volts_per_a: {volts_per_a.size} numbers, where there are {coils} coils; give one number for "
@@ -198,7 +197,7 @@ class NiInputs:
             self._task.close()
             raise
 
-    def currents_a(self) -> tuple[NDArray[np.float64], int]:
+    def currents_a(self) -> tuple[Floats, int]:
         """Currents (coils,) now, and when that was, in ns of the host's monotonic clock.
 
         Raises

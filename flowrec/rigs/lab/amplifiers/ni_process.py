@@ -24,12 +24,12 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     NS_PER_S,
     DeviceClock,
     Fit,
+    Floats,
     FlowrecError,
     Measured,
     Priority,
@@ -63,7 +63,7 @@ class Stream:
         self._clock = DeviceClock(unit=NS_PER_S / self._rate_hz, wrap=1 << 63)
         self._fit: Fit | None = None
         # First samples, and currents (n, coils), of the latest blocks.
-        self._blocks: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=_KEPT_BLOCKS)
+        self._blocks: deque[tuple[int, Floats]] = deque(maxlen=_KEPT_BLOCKS)
         for _ in range(BLOCKS_AHEAD):
             self._write(_REST)
         self._began_ns = device.run()
@@ -103,7 +103,7 @@ class Stream:
         self._written += self._count
         return block
 
-    def currents_a(self, at_ns: int) -> NDArray[np.float64]:
+    def currents_a(self, at_ns: int) -> Floats:
         """Currents (coils,) that are put out at a time of the host's monotonic clock."""
         fit = self._fit
         period_ns = NS_PER_S / self._rate_hz if fit is None else fit.rate

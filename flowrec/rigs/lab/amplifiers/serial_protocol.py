@@ -12,15 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowrec.core import Floats
 from flowrec.stages import Coils, FieldCommand, field_limits
 
 ZERO = b"\nZ\n"  # the newline ends a line that its writer may have left half written
 VERSION = 1  # of the protocol; a board with another one is refused
 _MILLION = 1_000_000  # revolutions and amperes are integers, in millionths
 _INT32 = 2**31 - 1  # largest integer that a controller reads
-_TURN_RAD = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +40,8 @@ class Telemetry:
     heading_rad: float  # direction in which the robot travels
     amplitude_mt: float
     turns: tuple[int, int]  # 1e-6 revolutions along x and y since the board started; wrap at 2^32
-    currents_a: NDArray[np.float64]  # (coils,)
-    measured_a: NDArray[np.float64] | None = None  # (coils,), by a board with sensors
+    currents_a: Floats  # (coils,)
+    measured_a: Floats | None = None  # (coils,), by a board with sensors
 
 
 def line(verb: str, number: int, *numbers: int) -> bytes:
@@ -71,7 +70,7 @@ def telemetry(answer: Reply, coils: int) -> Telemetry | None:
         return None
     if len(currents) not in (coils, 2 * coils):
         return None
-    heading_rad = heading / _MILLION * _TURN_RAD
+    heading_rad = heading / _MILLION * math.tau
     put_out_a = np.array(currents[:coils]) / _MILLION
     measured_a = np.array(currents[coils:]) / _MILLION if len(currents) == 2 * coils else None
     return Telemetry(clock, 1e-3 * mhz, heading_rad, 1e-3 * ut, (x, y), put_out_a, measured_a)
@@ -84,7 +83,7 @@ def field_line(number: int, command: FieldCommand) -> bytes:
         "F",
         number,
         round(command.frequency_hz * 1e3),
-        round(command.heading_rad / _TURN_RAD * _MILLION) % _MILLION,
+        round(command.heading_rad / math.tau * _MILLION) % _MILLION,
         math.floor(command.amplitude_mt * 1e3 + 1e-6),
         round(command.limit_hz * 1e3),
         ramp_ut_s,

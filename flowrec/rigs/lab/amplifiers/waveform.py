@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from flowrec.core import Floats
 from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.stages import FieldCommand, FieldState, MotionSegment, field_motion
 
@@ -22,8 +20,8 @@ class Block:
     segments : how the robot travels meanwhile; amplitude_mt : of the field in the middle.
     """
 
-    currents_a: NDArray[np.float64]
-    voltages_v: NDArray[np.float64]
+    currents_a: Floats
+    voltages_v: Floats
     segments: tuple[MotionSegment, ...]
     amplitude_mt: float
 

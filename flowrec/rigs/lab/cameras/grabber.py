@@ -19,9 +19,7 @@ from operator import attrgetter
 from typing import Self, TypeVar
 
 from flowrec.core import (
-    NS_PER_S,
     CameraLosses,
-    DeviceClock,
     Fit,
     Priority,
     RigError,
@@ -29,8 +27,8 @@ from flowrec.core import (
     realtime_priority,
     seconds,
 )
-from flowrec.rigs.lab.cameras.block_ids import BlockIds
 from flowrec.rigs.lab.cameras.camera import SOFTWARE, Camera, CameraInfo, Grabbed, Image, Wanted
+from flowrec.rigs.lab.cameras.device_counts import BlockIds, Stamper
 
 _SLICE_S = 0.1  # longest wait in the driver, so that the thread ends promptly
 _SILENT_S = 0.7  # without a frame, at least, before a camera is taken for absent
@@ -43,7 +41,6 @@ _AGAIN_S = 0.05  # between two attempts to open an absent camera
 _REPORT_S = 1.0  # between two messages of losses that are the same
 _RATE_S = 2.0  # over which a rate is measured, at least
 _RATE_ERROR = 0.03  # relative difference of the rate that is worth a note
-_FROZEN = 2  # frames in a row with the same device time: the clock stands still, and is not used
 
 CAUSES = ("link", "incomplete", "driver", "backlog", "triggers", "reconnections")  # fields of CameraLosses
 _loss_counts = attrgetter(*CAUSES)
@@ -119,7 +116,7 @@ class Grabber:
         self._reported: CameraLosses | None = None  # the latest one that a frame came with
         # Of the thread only.
         self._ids = BlockIds()
-        self._stamper = _Stamper()
+        self._stamper = Stamper()
         self._counts = CameraLosses(0, 0, 0, 0, 0, 0, 0, 0, 0)  # what the thread knows; frames and backlog stay 0
         self._span: tuple[tuple[int, int], tuple[int, int]] = (0, 0), (0, 0)  # index and stamp, first and last
         self._attributed = 0  # blocks of the driver's own count that are in the counts already
@@ -371,42 +368,6 @@ class _Pace:
         if not self._software or self._sent_s is not None:
             return _SLICE_S
         return min(max(self._due_s - time.monotonic(), 1e-3), _SLICE_S)
-
-
-class _Stamper:
-    """Stamps by the device's clock, or by the arrival where it has none."""
-
-    def __init__(self) -> None:
-        self.frozen = False  # the clock stands still
-        self._fit: Fit | None = None
-        self._stood = 0
-        self._last_ns: int | None = None
-        self._clock = DeviceClock()
-        self._before_ns = 0  # from the middle of an exposure to the arrival
-
-    def reset(self, info: CameraInfo, exposure_s: float, delay_s: float) -> None:
-        """Begin with a connection."""
-        if info.ticks_per_s:
-            self._clock = DeviceClock(unit=NS_PER_S / info.ticks_per_s)
-        self._before_ns = nanoseconds(0.5 * (info.exposure_s or exposure_s) + delay_s)
-        self._stood = 0
-        self.frozen = False
-
-    def take(self, ticks: int | None, arrival_ns: int) -> tuple[int, Fit | None, int | None]:
-        """The stamp of a frame, the fit that made it, and the stamp before."""
-        before_ns, fit = self._last_ns, None
-        stamp_ns = arrival_ns - self._before_ns
-        if ticks is not None and not self.frozen:
-            self._fit = self._clock.take(self._fit, ticks, arrival_ns)
-            self._stood = self._stood + 1 if self._fit.flag == "duplicate" else 0
-            self.frozen = self._stood == _FROZEN
-            if self._fit.good:
-                fit = self._fit
-                stamp_ns = fit.stamp_ns - self._before_ns
-        if before_ns is not None:
-            stamp_ns = max(stamp_ns, before_ns + 1)
-        self._last_ns = stamp_ns
-        return stamp_ns, fit, before_ns
 
 
 def _within(time_s: float, call: Callable[[], _T]) -> _T | None:

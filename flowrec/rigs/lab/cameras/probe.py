@@ -15,6 +15,8 @@ from flowrec.rigs.lab.cameras.camera import CameraInfo, NoCameraError, wanted_of
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from flowrec.stages import CAMERAS, CameraSettings, Lab
 
+_TAKEN_S, _PATIENCE_S = 2.5, 3.0  # for which images are taken; besides, for the first one to come
+
 
 @dataclass(frozen=True, slots=True)
 class CameraProbe:
@@ -78,14 +80,14 @@ def _silent(logger: logging.Logger) -> Iterator[None]:
         logger.disabled = before
 
 
-def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5, *, as_it_is: bool = False) -> CameraProbe:
+def probe_camera(camera: CameraSettings, lab: Lab, *, as_it_is: bool = False) -> CameraProbe:
     """Open the camera of a configuration, take its frames for some seconds, and close it.
 
     `as_it_is` takes its whole image, and its own exposure.
 
     Raises
     ------
-    RigError : as Camera.open, or no frame comes in three seconds more than the duration.
+    RigError : as Camera.open, or no frame comes in time.
     UsageError : a package is not installed; the line names the command.
     """
     wanted = wanted_of(camera, lab)
@@ -94,12 +96,12 @@ def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5, *, a
     driver = CAMERAS[lab.camera].load()
     frames: list[Captured] = []
     with Grabber(partial(driver.of, wanted), wanted, lab.queue_frames) as grabber:
-        end_s = time.monotonic() + duration_s
-        while time.monotonic() < end_s + (0.0 if frames else 3.0):
+        end_s = time.monotonic() + _TAKEN_S
+        while time.monotonic() < end_s + (0.0 if frames else _PATIENCE_S):
             frame = grabber.next(0.1)
             if frame is not None:
                 if not frames:
-                    end_s = time.monotonic() + duration_s
+                    end_s = time.monotonic() + _TAKEN_S
                 frames.append(frame)
         info, notes, losses = grabber.info, grabber.notes, grabber.losses
     if not frames and not wanted.trigger:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from flowrec.rigs.lab.cameras.block_ids import BlockIds
+from flowrec.rigs.lab.cameras.device_counts import BlockIds
 
 
 def unwrapped(ids: Iterable[int], bits: int, rate_hz: float = 0.0, period_ns: int = 10_000_000) -> list[int]:

@@ -1,17 +1,20 @@
-"""Block ids of a camera, unwrapped to the index of its frames: what is missing between two frames is a gap.
+"""Counts of a camera: the ids of its blocks, unwrapped to the index of its frames, and the ticks of its clock.
 
-Devices count differently. GigE Vision counts with 16 bits from 1 to 65535, then 1 again (0 is left out), or with 64
-bits ("extended ids"); USB3 Vision with 64 bits from 0. A new connection begins anew. Blocks may come out of order,
-because an incomplete one is given up late.
+What is missing between two ids is a gap; a frame is stamped by the ticks, fitted to the host's clock. Devices count
+differently. GigE Vision counts with 16 bits from 1 to 65535, then 1 again (0 is left out), or with 64 bits ("extended
+ids"); USB3 Vision with 64 bits from 0. A new connection begins anew. Blocks may come out of order, because an
+incomplete one is given up late.
 """
 
 from __future__ import annotations
 
-from flowrec.core import seconds
+from flowrec.core import NS_PER_S, DeviceClock, Fit, nanoseconds, seconds
+from flowrec.rigs.lab.cameras.camera import CameraInfo
 
 _BEHIND = 256  # blocks; an id that lies further back means that the device has begun to count anew
 _HASTE = 4.0  # a gap of more than so many times the blocks that fit into the time passed means the same
 _SLACK = 64  # blocks, for rates that are not what they are said to be
+_FROZEN = 2  # frames in a row with the same device time: the clock stands still, and is not used
 
 
 class BlockIds:
@@ -76,3 +79,39 @@ class BlockIds:
         index, arrived_ns = self._first
         due = self._rate_hz * seconds(arrival_ns - arrived_ns) - (self.index - index)
         return _SLACK + _HASTE * (max(due, 0.0) + self._rate_hz * seconds(arrival_ns - self._newest_ns))
+
+
+class Stamper:
+    """Stamps by the device's clock, or by the arrival where it has none."""
+
+    def __init__(self) -> None:
+        self.frozen = False  # the clock stands still
+        self._fit: Fit | None = None
+        self._stood = 0
+        self._last_ns: int | None = None
+        self._clock = DeviceClock()
+        self._before_ns = 0  # from the middle of an exposure to the arrival
+
+    def reset(self, info: CameraInfo, exposure_s: float, delay_s: float) -> None:
+        """Begin with a connection."""
+        if info.ticks_per_s:
+            self._clock = DeviceClock(unit=NS_PER_S / info.ticks_per_s)
+        self._before_ns = nanoseconds(0.5 * (info.exposure_s or exposure_s) + delay_s)
+        self._stood = 0
+        self.frozen = False
+
+    def take(self, ticks: int | None, arrival_ns: int) -> tuple[int, Fit | None, int | None]:
+        """The stamp of a frame, the fit that made it, and the stamp before."""
+        before_ns, fit = self._last_ns, None
+        stamp_ns = arrival_ns - self._before_ns
+        if ticks is not None and not self.frozen:
+            self._fit = self._clock.take(self._fit, ticks, arrival_ns)
+            self._stood = self._stood + 1 if self._fit.flag == "duplicate" else 0
+            self.frozen = self._stood == _FROZEN
+            if self._fit.good:
+                fit = self._fit
+                stamp_ns = fit.stamp_ns - self._before_ns
+        if before_ns is not None:
+            stamp_ns = max(stamp_ns, before_ns + 1)
+        self._last_ns = stamp_ns
+        return stamp_ns, fit, before_ns
