@@ -139,6 +139,7 @@ def why_ended(control: RunControl) -> str:
     return str(taken[-1].why)
 
 
+@pytest.mark.slow("steers a run on a page of a browser")
 def test_a_hand_steers_where_the_image_shows_and_lets_go_when_its_page_is_closed(scene: Scene) -> None:
     with (served := Served(scene, clock=lambda: 0.0)).console:  # no sample is late, however busy the machine is
         hand = served.control.hand

@@ -100,6 +100,7 @@ def test_a_live_view_listens_on_this_machine_only_and_ends_with_the_run(scene: S
     live.close()
 
 
+@pytest.mark.slow("starts a viewer's server and a listener, and waits until it has sent all")
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the listener is interrupted
 def test_a_viewer_receives_every_tick_and_a_smaller_image_and_its_server_stays_until_it_has_left(
     tmp_path: Path, scene: Scene, ticks: list[Tick]
