@@ -85,7 +85,7 @@ def scores_of(best: HypothesisFit, assumed: FlowField, before: FlowField | None)
 
     `before` is the refined flow in use; None: it is the assumed one.
     """
-    operator, group = best.observed.stated, groups(best.observed.stated.count)
+    operator, group = best.observed.stated, groups(best.observed.stated)
     which = np.arange(int(group[-1]) + 1)
     if before is not None:
         which = which[np.bincount(group, ~made_after(operator, before)) == 0]

@@ -389,15 +389,22 @@ def _evidence(
     return EffectModel(y, least * np.eye(len(stated)), effects)
 
 
-def groups(count: int) -> NDArray[np.intp]:
-    """(n,) number of the mean that each observation is a part of, in order."""
-    return np.arange(count) * min(MOST_OBSERVATIONS, count) // count
+def groups(operator: ObservationOperator) -> NDArray[np.intp]:
+    """(n,) number of the mean that each observation is a part of, in order; each tracer's is one by itself.
+
+    Neighbours along the way of a robot show nearly the same flow, one tracer and the next do not.
+    """
+    count = operator.count
+    tracers = 0 if operator.tracer is None else int(np.count_nonzero(operator.tracer >= 0.0))
+    rolled = count - tracers
+    means = min(max(MOST_OBSERVATIONS - tracers, 1), rolled)
+    return np.concatenate([np.arange(rolled) * means // max(rolled, 1), means + np.arange(tracers)])
 
 
 def averages(robust: Robust, operator: ObservationOperator) -> Floats:
     """(m, 2 n) weighted means of neighbours along the way, x and y of each in turn; the identity for few."""
     count = operator.count
-    group = groups(count)
+    group = groups(operator)
     weight = robust.inlier / robust.variance
     matrix = np.zeros((group[-1] + 1, count))
     matrix[group, np.arange(count)] = weight

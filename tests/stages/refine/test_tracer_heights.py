@@ -12,6 +12,7 @@ from flowrec.physics import ChipSettings, FlowSolver, load_chip, sample
 from flowrec.stages.refine import Assimilate, Refiner
 from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.flow_model import flow_model
+from flowrec.stages.refine.hypothesis import MOST_OBSERVATIONS, groups
 from flowrec.stages.refine.observation_operator import observation_operator
 from flowrec.stages.refine.tracer_heights import ENTERED, EVEN, LEAST_PX, MOST, MOST_EACH, at_mean_height
 
@@ -82,6 +83,19 @@ def test_what_the_robot_observed_is_left_as_it_is_and_few_of_each_tracer_are_use
     few = at_mean_height(of_beads(3, 1, each=40), ASSUMED, DUCT)
     assert np.bincount(few.tracer.astype(int)).tolist() == [MOST_EACH] * 3
     assert at_mean_height(robot, ASSUMED, DUCT) is robot and robot.with_tracers(None) is robot
+
+
+def test_where_observations_are_averaged_along_the_way_of_the_robot_each_tracer_stays_by_itself() -> None:
+    beads = at_mean_height(of_beads(200, 1), ASSUMED, DUCT)
+    way = of_beads(1, 2, each=170)
+    robot = replace(way, rolled_um_s=way.flow_um_s, radius_um=50.0, tracer=None, entered=None)
+    joined = robot.with_tracers(beads)
+    group = groups(observation_operator(joined, DUCT.mask, DUCT.um_per_px, None))
+    assert np.bincount(group)[-MOST:].tolist() == [1] * MOST
+    assert group.max() + 1 == MOST_OBSERVATIONS and (np.diff(group) >= 0).all()
+    assert set(np.bincount(group[:170])) == {2, 3}
+    alone = groups(observation_operator(robot, DUCT.mask, DUCT.um_per_px, None))
+    assert alone.tolist() == (np.arange(170) * MOST_OBSERVATIONS // 170).tolist()
 
 
 def test_a_tracer_beside_a_wall_that_may_be_off_is_not_used() -> None:
