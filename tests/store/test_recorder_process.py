@@ -163,7 +163,7 @@ def last_told(run, number):
 KINDS = {
     "faster than real time": ("WriterOptions(own_process=True, block=True)", 0.0, 64),
     "live": ("WriterOptions(own_process=True)", 0.002, 64),
-    "large": ("WriterOptions(own_process=True, frames='raw')", 0.02, 2000),
+    "large": ("WriterOptions(own_process=True, block=True, frames='raw')", 0.02, 2000),
     "forked": ("WriterOptions(own_process=True)", 0.002, 64, "fork"),
     "parts": ("WriterOptions(own_process=True, files=Split(seconds=0.5))", 0.002, 64),
 }
