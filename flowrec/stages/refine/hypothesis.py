@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # its sparse loads at first use, not at start-up
 from numpy.typing import NDArray
 
 from flowrec.core import Bools, Floats
@@ -375,11 +376,12 @@ def _evidence(
     effects, stated, y = observed.effects(in_use, line_hz), np.diag(noise), misfit.ravel()
     if here.count > MOST_OBSERVATIONS:
         average = averages(robust, here)
+        few = scipy.sparse.csr_array(average)  # a mean is of two or three observations
         effects = [
             replace(
                 effect,
-                columns=effect.columns @ average.T,
-                kernel=None if effect.kernel is None else average @ effect.kernel @ average.T,
+                columns=(few @ effect.columns.T).T,
+                kernel=None if effect.kernel is None else few @ (few @ effect.kernel).T,  # it is symmetric
             )
             for effect in effects
         ]
