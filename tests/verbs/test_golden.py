@@ -87,6 +87,13 @@ def test_what_a_refinement_finds_of_the_robot_corrects_nothing_in_a_session_from
     assert not refiner.correct_robot and not refiner.correct_heading
 
 
+@pytest.mark.parametrize("path", [GOLDEN, MODERATE, SETTLED])
+def test_a_session_from_before_keeps_the_step_out_and_the_spots_of_its_time(path: Path) -> None:
+    config = flowrec.open(path).config
+    assert config.health.step_out.least_gain == -0.5
+    assert config.tracker.tracer.most_elongated == 0.0
+
+
 def means_over_pixels(equations: System, flux: NDArray[np.float64]) -> NDArray[np.float64]:
     """The velocity (h, w, 2) in m/s as version 1 of the numerics gave it."""
     grid, padded = equations.grid, np.append(flux, 0.0)
