@@ -49,6 +49,7 @@ class DiskMonitor:
     written : returns the bytes of the session so far.
     floor_gb : below it `low` is called once with the reason; 0: never.
     free : returns the free bytes of a folder.
+    clock_s : returns the time of a sample, which only differences are taken of.
     """
 
     def __init__(
@@ -58,12 +59,14 @@ class DiskMonitor:
         floor_gb: float,
         low: Callable[[str], None],
         free: FreeBytes = free_bytes,
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder = folder
         self._written = written
         self._floor_gb = floor_gb
         self._low = low
         self._free = free
+        self._clock_s = clock_s
         self._left: int | None = None
         self._samples: deque[tuple[float, int]] = deque(maxlen=_SAMPLES)
 
@@ -88,7 +91,7 @@ class DiskMonitor:
         except OSError:
             self._left = None  # the writer will get the error
             return False
-        self._samples.append((time.monotonic(), self._written()))
+        self._samples.append((self._clock_s(), self._written()))
         if self._floor_gb > 0.0 and self._left < self._floor_gb * _GB:
             self._low(f"disk floor: {self._left / _GB:.2g} GB left on {self._folder}")
             return True

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,13 +167,10 @@ def test_keys_become_events_in_order_and_notes_are_typed_without_being_obeyed() 
     assert Asked.by("mq!")[0][0] == "zero"
 
 
-def test_below_its_floor_the_disk_ends_the_run_once_and_says_how_long_it_will_last(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_below_its_floor_the_disk_ends_the_run_once_and_says_how_long_it_will_last(tmp_path: Path) -> None:
     left, written, told = [5_000_000_000], [0], []
     clock = iter((0.0, 1.0, 2.0))
-    monkeypatch.setattr("flowrec.run.disk_monitor.time", SimpleNamespace(monotonic=lambda: next(clock)))
-    watch = DiskMonitor(tmp_path, lambda: written[0], 1.0, told.append, lambda _folder: left[0])
+    watch = DiskMonitor(tmp_path, lambda: written[0], 1.0, told.append, lambda _folder: left[0], clock.__next__)
     assert not watch.sample()
     written[0] = 10_000_000
     assert not watch.sample()
