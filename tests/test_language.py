@@ -43,9 +43,17 @@ def definitions() -> list[tuple[str, ast.Module | ast.ClassDef | Function]]:
     return [
         (path.relative_to(PACKAGE).as_posix(), node)
         for path in sorted(PACKAGE.rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Module | ast.ClassDef | Function)
+        for node in within(ast.parse(path.read_text(encoding="utf-8")))
     ]
+
+
+def within(node: ast.AST) -> Iterator[ast.Module | ast.ClassDef | Function]:
+    """A module, class or function and those inside; expressions, most of a tree, hold none."""
+    if isinstance(node, ast.Module | ast.ClassDef | Function):
+        yield node
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
+            yield from within(child)
 
 
 def length_of(function: Function) -> int:

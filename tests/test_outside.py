@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -208,10 +209,7 @@ def test_without_the_package_its_session_is_read_and_a_replay_says_what_to_insta
     assert len(refused) == 4
     for said in refused:
         assert said.status == 2
-        assert said.err.strip().splitlines()[-1] == (
-            "flowrec: plan.method = lab_kit_steps is of the package lab_kit 1.0, which is not installed: "
-            "pip install lab_kit==1.0"
-        )
+        assert re.search(r"plan\.method = lab_kit_steps .*: pip install lab_kit==1\.0\s*$", said.err)
     assert replanned.status == again.status == 0, "another planner needs no package"
     assert checked.status == 0 and "its stages need the packages lab_kit 1.0" in checked.out
     assert json.loads(shown.out)["facts"]["plan"] == "lab_kit_steps"

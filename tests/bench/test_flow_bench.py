@@ -126,12 +126,13 @@ def test_a_figure_is_drawn_even_where_a_method_is_far_off_or_perfect(tmp_path):
 
 
 def test_wrong_requests_are_said_in_one_line_before_anything_is_computed(folder, tmp_path, monkeypatch):
-    with pytest.raises(UsageError, match="no method 'magic'"):
-        flow.measure(folder, "magic")
-    with pytest.raises(UsageError, match="no case 'made_up_77'; there are made_up_00"):
-        flow.measure(folder, "fvm", case="made_up_77")
-    with pytest.raises(UsageError, match="no vessel case"):
-        flow.measure(tmp_path, "fvm")
+    for words, named in (
+        ({"cases": folder, "methods": "magic"}, "magic"),
+        ({"cases": folder, "methods": "fvm", "case": "made_up_77"}, "made_up_77.*made_up_00"),
+        ({"cases": tmp_path, "methods": "fvm"}, str(tmp_path)),
+    ):
+        with pytest.raises(UsageError, match=named):
+            flow.measure(**words)
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(UsageError, match=r"needs matplotlib, .* pip install 'flowrec\[notebook\]'"):
         need_matplotlib()

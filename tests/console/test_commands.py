@@ -34,20 +34,11 @@ def test_what_a_page_asks_becomes_an_event_and_nonsense_is_refused(scene: Scene)
             assert answer(**words), words
         page.send("[]")
         assert json.loads(page.recv())["refusal"]
-        time.sleep(1.1)  # refused ones count, too
         for name in ("mark", "note", "hold", "end"):
             assert answer(command=name, text="look\x1b[31m") == ""
         assert answer(command="goal", x_px=10.0, y_px=20.0) == ""
         assert answer(command="speed", limit_um_s=120) == ""
-        told: list[str] = []
-        for _ in range(10):  # on a busy machine a dozen may take more than the second in which they are counted
-            for _ in range(12):
-                page.send(json.dumps({"number": 7, "command": "mark"}))
-            told += [words["refusal"] for words in itertools.islice(answers_to(page), 12)]
-            if any("too many at once" in refusal for refusal in told):
-                break
-        assert any("too many at once" in refusal for refusal in told)
-        until(lambda: len(served.control._waiting) >= 5 and all(map(len, served.control._steering.values())))
+        until(lambda: len(served.control._waiting) >= 4 and all(map(len, served.control._steering.values())))
         # The stop is never one too many, and it is before all that waits.
         assert answer(command="zero") == ""
         until(lambda: served.control.reason)

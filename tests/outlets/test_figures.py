@@ -9,7 +9,6 @@ from typing import cast
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
@@ -33,6 +32,8 @@ def data(session: Session) -> ReportData:
 @pytest.fixture(autouse=True)
 def closed() -> Iterator[None]:
     yield
+    from matplotlib import pyplot
+
     pyplot.close("all")
 
 
@@ -128,6 +129,8 @@ UNITS_UM = {"µm": 1.0, "mm": 1e3}
 
 @pytest.mark.parametrize("um_per_unit", [0.7, 2.5, 7.0, 13.0, 90.0])
 def test_a_scale_bar_is_as_long_as_it_says(um_per_unit: float) -> None:
+    from matplotlib import pyplot
+
     figure, ax = pyplot.subplots()
     ax.set_xlim(11.0, 611.0)
     scale_bar(ax, 1e3 / um_per_unit)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
-import xarray
 
 import flowrec
 from flowrec.core import UsageError
@@ -156,6 +156,8 @@ def test_a_persons_table_without_deviations_counts_each_at_a_twentieth_of_the_us
 
 
 def test_zarr_has_images_and_fields_with_axes_in_um(session: Session, exported: dict[str, Path]) -> None:
+    import xarray
+
     with xarray.open_zarr(exported["zarr"]) as images:
         frames = images["frames"]
         assert frames.dims == ("time", "y_px", "x_px")
@@ -169,6 +171,8 @@ def test_zarr_has_images_and_fields_with_axes_in_um(session: Session, exported: 
         np.testing.assert_allclose((here["x_um"], here["y_um"]), chip_um, rtol=1e-6)
         assert images["x_um"].attrs["units"] == images["y_um"].attrs["units"] == "um"
         assert frames.attrs["bits"] == p.BITS
+    import xarray
+
     with xarray.open_zarr(exported["zarr"], group="refined") as flow:
         check_dataset(flow)
 
@@ -195,7 +199,7 @@ def test_all_fields_are_one_dataset_that_is_selected_by_name_and_place_and_can_b
         type(fields)().to_xarray()
 
 
-def check_dataset(flow: xarray.Dataset) -> None:
+def check_dataset(flow: Any) -> None:
     row, column = 9, 51
     here = flow.sel(x_um=column * p.UM_PER_PX, y_um=row * p.UM_PER_PX)
     np.testing.assert_allclose(here["velocity_um_s"], at(row, column, p.REFINED_UM_S), rtol=1e-6)

@@ -50,11 +50,8 @@ def test_the_proportional_robot_is_as_fast_and_comes_back_to_the_same_table():
 
 @pytest.mark.parametrize("table", ["[[5, 100], [5, 120]]", "[[5, 100], [10, 90]]", "[[10, 100], [5, 120]]"])
 def test_a_table_that_does_not_rise_is_refused_in_one_line(table):
-    with pytest.raises(
-        UsageError, match=r"--set: robot\.speed_at_hz: frequencies and speeds must both rise"
-    ) as refused:
+    with pytest.raises(UsageError, match=r"^--set: robot\.speed_at_hz: [^\n]*$"):
         load_config(None, [f"robot.speed_at_hz={table}"])
-    assert "\n" not in str(refused.value)
     with pytest.raises(UsageError, match=r"robot\.speed_at_hz"):
         load_config(None, ["robot.speed_at_hz=[[5, -1]]"])
 

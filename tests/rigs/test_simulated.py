@@ -257,14 +257,15 @@ def test_in_real_time_frames_keep_to_the_clock(monkeypatch):
 
 
 def test_a_world_that_can_not_be_is_refused_in_one_line():
-    with pytest.raises(ChipError, match="start 1000,100 um is in a wall"):
-        rig_with(start=(1000.0, 100.0))
-    with pytest.raises(ChipError, match="nearer to a wall than 50 um"):
-        rig_with(start=(1000.0, 450.0))
-    with pytest.raises(UsageError, match=r"simulated\.image\.photons_per_level = 0"):
-        rig_with(simulated=replace(EXACT, image=SimulatedImage(photons_per_level=0.0)))
-    with pytest.raises(UsageError, match=r"inlet_speed_error = 1\.5"):
-        rig_with(simulated=replace(EXACT, inlet_speed_error=1.5))
+    dark = replace(EXACT, image=SimulatedImage(photons_per_level=0.0))
+    for wrong, named in (
+        ({"start": (1000.0, 100.0)}, "start 1000,100 um"),  # in a wall
+        ({"start": (1000.0, 450.0)}, "start 1000,450 um .*50 um"),  # nearer to one than its radius
+        ({"simulated": dark}, r"simulated\.image\.photons_per_level = 0"),
+        ({"simulated": replace(EXACT, inlet_speed_error=1.5)}, r"inlet_speed_error = 1\.5"),
+    ):
+        with pytest.raises((ChipError, UsageError), match=named):
+            rig_with(**wrong)
     other = FlowSolver(1).solve(load_chip(ChipSettings("bifurcation")))
     with pytest.raises(RigError, match="solve it on this chip"):
         next(iter(rig_with(flow=other).inputs()))

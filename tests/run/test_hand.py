@@ -251,7 +251,7 @@ def test_people_are_told_who_steers_why_it_ended_and_what_goes_on(steered: tuple
 def test_a_replay_has_the_same_commands_by_the_recorded_samples_from_any_tick(steered: tuple[Path, list[Tick]]) -> None:
     path, _ = steered
     assert replay_session(path, verify=True).identical
-    for from_s in (1.2, 1.6, 3.0):
+    for from_s in (1.2, 3.0):  # while the first and the second press steer
         assert replay_session(path, verify=True, from_s=from_s).identical, from_s
 
 

@@ -20,7 +20,7 @@ import flowrec
 from flowrec.core import FlowrecError, SessionError, UnreachableError, UsageError
 from flowrec.physics import ChipSettings, load_chip
 from flowrec.run import refuse_below
-from flowrec.stages import RIGS, Config, config_from_toml, load_config, to_toml, with_sets
+from flowrec.stages import Config, config_from_toml, load_config, to_toml, with_sets
 from flowrec.stages.config import _BEFORE, _MOVED
 from flowrec.stages.resolve import resolve
 from flowrec.store import SessionReader
@@ -60,18 +60,19 @@ def test_a_session_is_read_by_the_former_key_of_a_setting_and_a_person_is_told_t
     assert config_from_toml(tomli_w.dumps(tree), "a session") == resolved
 
 
-def test_an_unknown_key_is_refused_with_the_nearest_known_one() -> None:
-    with pytest.raises(UsageError, match=r"unknown key observer\.metod; did you mean observer\.method\?"):
-        load_config(None, ["observer.metod=kalman"])
-
-
-def test_a_wrong_value_is_refused_with_its_key() -> None:
-    with pytest.raises(UsageError, match=r"control\.method = 'telepathy'"):
-        load_config(None, ["control.method=telepathy"])
-    with pytest.raises(UsageError, match=r"robot\.max_speed_um_s = -1: must be from 0.01 to .*; the nearest is 0.01"):
-        load_config(None, ["robot.max_speed_um_s=-1"])
-    with pytest.raises(UsageError, match=r"dance': must be one of survey"):
-        load_config(None, ["mission.phases=survey,dance"])
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("observer.metod=kalman", r"observer\.metod; .*observer\.method\?"),
+        ("control.method=telepathy", r"control\.method = 'telepathy'"),
+        ("robot.max_speed_um_s=-1", r"robot\.max_speed_um_s = -1: .* 0\.01$"),
+        ("mission.phases=survey,dance", "dance': .*survey"),
+        ("rig=simulatd", "rig = 'simulatd': .* simulated$"),
+    ],
+)
+def test_an_unknown_key_or_value_is_refused_by_its_name_with_what_is_nearest(wrong: str, told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        load_config(None, [wrong])
 
 
 def test_phases_may_be_given_as_words_with_commas() -> None:
@@ -93,19 +94,12 @@ def test_every_example_configuration_resolves() -> None:
         assert isinstance(resolved.mission.goal, tuple)
 
 
-def test_a_goal_in_a_wall_or_outside_is_refused() -> None:
+def test_a_goal_in_a_wall_or_outside_or_at_no_place_of_the_chip_is_refused() -> None:
     config = load_config(None, [])
     chip = load_chip(config.chip)
-    with pytest.raises(UsageError, match="goal"):
-        resolve(with_sets(config, ["mission.goal=[0.0, 0.0]"]), chip)
-    with pytest.raises(UsageError, match="goal"):
-        resolve(with_sets(config, ["mission.goal=[1e6, 0.0]"]), chip)
-
-
-def test_a_place_that_the_chip_does_not_have_is_refused_with_those_it_has() -> None:
-    config = load_config(None, ["mission.goal=outlet:9"])
-    with pytest.raises(UsageError, match=r"outlet:9.*it has"):
-        resolve(config, load_chip(config.chip))
+    for goal, named in (("[0.0, 0.0]", "goal"), ("[1e6, 0.0]", "goal"), ("outlet:9", "outlet:9.*outlet:0")):
+        with pytest.raises(UsageError, match=named):
+            resolve(with_sets(config, [f"mission.goal={goal}"]), chip)
 
 
 KEY = re.compile(r"(?<![\w/.*{])([a-z_]{2,}(?:\.[a-z_0-9]+)+)")
@@ -203,13 +197,6 @@ def test_a_goal_in_another_channel_is_unreachable() -> None:
     assert caught.value.exit_status == 1
 
 
-def test_an_unknown_rig_is_an_error_that_names_the_rigs_of_the_table() -> None:
-    with pytest.raises(UsageError, match=r"rig = 'simulatd': must be one of .*; the nearest is simulated"):
-        load_config(None, ["rig=simulatd"])
-    for row in RIGS.values():
-        assert hasattr(row.load(), "of")
-
-
 def test_a_rig_that_is_not_simulated_needs_its_robot_and_camera_measured() -> None:
     config = replace(Config(), rig="bench")  # type: ignore[arg-type]
     chip = load_chip(config.chip)
@@ -224,9 +211,7 @@ def test_a_rig_that_is_not_simulated_needs_its_robot_and_camera_measured() -> No
 
 def test_a_limit_that_the_method_of_the_survey_does_not_read_is_refused_with_those_it_reads() -> None:
     config = load_config(None, ["survey.share=0.5"])
-    with pytest.raises(
-        UsageError, match=r"survey\.share = 0\.5 has no effect on survey\.method = 'information'.*distance"
-    ):
+    with pytest.raises(UsageError, match=r"survey\.share = 0\.5 .*survey\.method = 'information'.*distance"):
         resolve(config, load_chip(config.chip))
     resolve(with_sets(config, ["survey.method=downstream"]), load_chip(config.chip))
 
@@ -295,9 +280,7 @@ def test_a_path_that_is_there_only_from_the_working_directory_is_not_guessed(tmp
     (tmp_path / "a.png").write_text("")
     (tmp_path / "lab" / "lab.toml").write_text('[chip]\npath = "a.png"\n')
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(
-        UsageError, match=r"lab\.toml: chip\.path = 'a\.png' is not in the folder.*write path = '\.\./a"
-    ):
+    with pytest.raises(UsageError, match=r"lab\.toml: chip\.path = 'a\.png' .*'\.\./a"):
         load_config(Path("lab/lab.toml"))
 
 

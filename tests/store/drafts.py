@@ -10,6 +10,7 @@ import typing
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -130,6 +131,7 @@ def text(words: str) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
+@cache
 def small_draft() -> Draft:
     """A dozen ticks with a message of every topic, in a head that is real; always the same bytes."""
     config = load_config()

@@ -15,12 +15,7 @@ from tests.store.range_server import served
 _CHUNK_OPCODE = 6
 
 
-DRAFT = small_draft()
-
-
 STATE = SLOTS["/robot/estimate"].channel
-
-
 FRAMES = SLOTS["/camera/frame"].channel
 
 
@@ -52,10 +47,10 @@ def _refused(path, match):
 
 def with_piece(holding, change):
     """The draft with its first chunk of a channel changed."""
-    pieces = list(DRAFT.pieces)
+    pieces = list(small_draft().pieces)
     number = next(i for i, piece in enumerate(pieces) if any(sent.channel == holding for sent in piece.messages))
     pieces[number] = change(pieces[number])
-    return replace(DRAFT, pieces=tuple(pieces))
+    return replace(small_draft(), pieces=tuple(pieces))
 
 
 def with_message(holding, change):
@@ -70,13 +65,13 @@ def with_message(holding, change):
 
 def with_head(opcode, body):
     """The draft with one more record in its head, before the first of its kind."""
-    head = list(DRAFT.head)
+    head = list(small_draft().head)
     head.insert(next(i for i, part in enumerate(head) if part[0] == opcode), (opcode, body))
-    return replace(DRAFT, head=tuple(head))
+    return replace(small_draft(), head=tuple(head))
 
 
 def with_index(change):
-    return replace(DRAFT, change_index=change)
+    return replace(small_draft(), change_index=change)
 
 
 def attached(name, data):

@@ -101,11 +101,10 @@ def test_other_programs_see_all_bits_of_a_deep_image_and_learn_its_depth(name, t
 
 
 def test_an_image_of_another_depth_than_the_session_is_refused_in_one_line(tmp_path):
-    with pytest.raises(SessionError, match="12 bit in a session of 8 bit; set camera"):
-        record(tmp_path / "s.mcap", "zstd", [deeper(TICKS[0], 12)])
-    with pytest.raises(UsageError, match="'jpeg' holds 8 bit, the camera has 12"):
-        record(tmp_path / "t.mcap", "jpeg", [deeper(TICKS[0], 12)], bits=12)
-    with pytest.raises(UsageError, match=r"'jpeg' holds 8 bit, camera\.bits = 12"):
+    for encoding, options, told in (("zstd", {}, "12 bit .* 8 bit"), ("jpeg", {"bits": 12}, "'jpeg' .*8 bit.* 12")):
+        with pytest.raises((SessionError, UsageError), match=told):
+            record(tmp_path / f"{encoding}.mcap", encoding, [deeper(TICKS[0], 12)], **options)
+    with pytest.raises(UsageError, match=r"'jpeg' .*camera\.bits = 12"):
         load_config(None, ["camera.bits=12", "recording.frames=jpeg"])
     for bits, level in ((12, 4096), (10, 1024), (14, 65_535)):
         with pytest.raises(RigError, match=f"a grey level of {level} in an image of {bits} bit"):

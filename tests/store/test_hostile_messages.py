@@ -33,9 +33,8 @@ from flowrec.stages import config_from_toml
 from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
 from tests.conftest import invoke
-from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, text
+from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, small_draft, text
 from tests.store.hostile import (
-    DRAFT,
     FRAMES,
     STATE,
     attached,
@@ -69,7 +68,7 @@ def test_names_of_attachments_lead_nowhere(tmp_path, name):
 def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypatch):
     inner = tmp_path / "inner"
     inner.mkdir()
-    (tmp_path / "secret.mcap").write_bytes(DRAFT.build())
+    (tmp_path / "secret.mcap").write_bytes(small_draft().build())
     drawn = []
 
     def drawn_beside(_part, _scene, ticks, *_, **__):
@@ -78,8 +77,8 @@ def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypat
     monkeypatch.setattr("flowrec.exports.rrd.write_rrd", drawn_beside)
     for name in ("../secret.mcap", str(tmp_path / "secret.mcap"), "..", "a\0b", ""):
         parent = text("flowrec.parent") + packed_map({"file": name, "sha256": "0"})
-        head = tuple(part for part in DRAFT.head if not part[1].startswith(text("flowrec.parent")))
-        export(file_of(inner, replace(DRAFT, head=(*head, (METADATA, parent)))), overwrite=True)
+        head = tuple(part for part in small_draft().head if not part[1].startswith(text("flowrec.parent")))
+        export(file_of(inner, replace(small_draft(), head=(*head, (METADATA, parent)))), overwrite=True)
     assert drawn == [False] * 5
 
 
@@ -188,7 +187,7 @@ HARMFUL = "\x1b[2J\x1b]0;owned\x07<script>alert(1)</script>\r\n\u202egnp.exe\x9b
 
 def test_text_in_a_file_can_not_steer_a_terminal(tmp_path):
     outcome = text("flowrec.outcome") + packed_map({"outcome": HARMFUL, "note": HARMFUL, "route": HARMFUL})
-    path = file_of(tmp_path, replace(DRAFT, tail=((METADATA, outcome),)))
+    path = file_of(tmp_path, replace(small_draft(), tail=((METADATA, outcome),)))
     for words in (["info", path], ["ls", tmp_path], ["check", path]):
         shown = invoke(*words).output
         assert "owned" in shown or "\\x1b" in shown
@@ -233,8 +232,6 @@ def test_a_state_of_more_than_176_mb_is_refused_whichever_way_it_is_read(tmp_pat
             writer.write(tick)
     with SessionReader(path) as reader:
         assert next(reader.ticks()).assumed is not None
-        with pytest.raises(SessionError, match=r"takes 199\d{6} bytes, more than 184549376"):
-            for _tick in reader.ticks():
-                pass
-        with pytest.raises(SessionError, match=r"takes 199\d{6} bytes, more than 184549376"):
-            reader.tick_before(reader.last_ns)
+        for read in (lambda: list(reader.ticks()), lambda: reader.tick_before(reader.last_ns)):
+            with pytest.raises(SessionError, match=r"199\d{6} bytes.* 184549376"):
+                read()

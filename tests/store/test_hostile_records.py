@@ -17,10 +17,9 @@ from flowrec.core import SessionError
 from flowrec.store import SessionReader, recover
 from flowrec.verbs.check import check
 from tests.conftest import invoke
-from tests.store.drafts import CHANNEL, CHUNK_INDEX, MESSAGE, METADATA, SCHEMA, TICKS, record, text
+from tests.store.drafts import CHANNEL, CHUNK_INDEX, MESSAGE, METADATA, SCHEMA, TICKS, record, small_draft, text
 from tests.store.hostile import (
     _CHUNK_OPCODE,
-    DRAFT,
     FRAMES,
     STATE,
     file_of,
@@ -79,7 +78,7 @@ def test_a_length_beyond_the_file_is_told(tmp_path, place, length):
         path.write_bytes(with_index(change).build())
         refused(path, "do not fit into the file")
     else:
-        data = bytearray(DRAFT.build())
+        data = bytearray(small_draft().build())
         marks = (found.start() - 9 - 28 for found in re.finditer(rb"\x04\x00\x00\x00zstd", data))
         at = next(mark for mark in marks if data[mark] == _CHUNK_OPCODE)
         data[at + 1 : at + 9] = struct.pack("<Q", length)
@@ -128,10 +127,10 @@ def test_a_wrong_checksum_costs_its_chunk_and_is_counted(tmp_path):
     ],
 )
 def test_declarations_that_make_no_sense_are_refused_and_passed_over_by_recovery(tmp_path, opcode, body, match):
-    head = list(DRAFT.head)
+    head = list(small_draft().head)
     last = max(i for i, part in enumerate(head) if part[0] == opcode)
     head.insert(last + 1, (opcode, body))
-    path = file_of(tmp_path, replace(DRAFT, head=tuple(head)))
+    path = file_of(tmp_path, replace(small_draft(), head=tuple(head)))
     refused(path, match)
     assert check(path).exit_status == 1
     done = saved(path, tmp_path)
@@ -144,9 +143,9 @@ def with_session(**said):
         (opcode, text("flowrec.session") + packed_map(said))
         if opcode == METADATA and body[4:].startswith(b"flowrec.session")
         else (opcode, body)
-        for opcode, body in DRAFT.head
+        for opcode, body in small_draft().head
     ]
-    return replace(DRAFT, head=tuple(head))
+    return replace(small_draft(), head=tuple(head))
 
 
 def test_a_version_of_thousands_of_digits_is_cut_and_does_not_hide_the_other_sessions(tmp_path):
@@ -163,7 +162,7 @@ def test_schemas_without_end_are_refused_before_all_are_read(tmp_path, where, mo
     if where == "index":
         draft = with_index(lambda parts: [(SCHEMA, schema)] * many + parts)
     else:
-        draft = replace(DRAFT, head=((SCHEMA, schema),) * many + DRAFT.head)
+        draft = replace(small_draft(), head=((SCHEMA, schema),) * many + small_draft().head)
     path, parsed, read = file_of(tmp_path, draft), [], Schema.read
     monkeypatch.setattr(Schema, "read", lambda stream: (parsed.append(1), read(stream))[1])
     refused(path, "more than 10000 records besides chunks")
@@ -178,7 +177,7 @@ def test_chunk_shapes_planted_in_damage_do_not_cost_more_than_they_hold(tmp_path
     # Behind some ticks. Each one announces megabytes that follow: to look at all for each would take hours.
     shape = struct.pack("<BQQQQI", 6, 4 << 20, 0, 0, 4 << 20, 1) + b"\x04\x00\x00\x00zstd" + struct.pack("<Q", 4 << 20)
     path = tmp_path / "hostile.mcap.partial"
-    path.write_bytes(DRAFT.build()[:120_000] + b"\xff" * 20 + shape * 90_000)
+    path.write_bytes(small_draft().build()[:120_000] + b"\xff" * 20 + shape * 90_000)
     assert "damaged or cut-off bytes" in recover(path, tmp_path / "saved.mcap").lost
 
 

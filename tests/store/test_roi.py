@@ -92,9 +92,7 @@ def test_a_mission_in_windows_replays_exactly_from_anywhere_and_says_what_it_is(
     # Another controller looks at the same pixels; another tracker may not.
     out = tmp_path / "r.mcap"
     verb.replay_session(path, Change(sets=("tracker.search_radii=4",)), out=out, frames=True)
-    assert "most images are black outside of what the recorded tracker read" in " ".join(
-        capsys.readouterr().err.split()
-    )
+    assert "black" in capsys.readouterr().err
     assert SessionReader(out).region == SessionReader(path).region is not None
     for was, now in zip(SessionReader(path).messages("frame"), SessionReader(out).messages("frame"), strict=False):
         assert was.same_as(now)

@@ -280,9 +280,8 @@ def test_a_part_that_repeats_something_else_is_odd(run):
             writer.close(reader.outcome)
     verdict = check(run)
     assert verdict.exit_status == 3
-    assert [f.text for f in verdict.findings] == [
-        "part 3 repeats other messages than the part before ended with: /robot/estimate"
-    ]
+    (finding,) = verdict.findings
+    assert "part 3" in finding.text and finding.text.endswith("/robot/estimate")
 
 
 @pytest.mark.slow("replays a run and each of its parts")

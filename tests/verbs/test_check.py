@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 import signal
 import struct
 from dataclasses import replace
@@ -21,13 +22,12 @@ from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_dra
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_run_files import in_parts
 
-DRAFT = small_draft()
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
 FRAMES, TRACK = SLOTS["/camera/frame"].channel, SLOTS["/robot/track"].channel
 APPLIED, TIMING = SLOTS["/coils/applied"].channel, SLOTS["/run/timing"].channel
 
 
-def file_of(tmp_path, draft=DRAFT, name="s.mcap"):
+def file_of(tmp_path, draft, name="s.mcap"):
     path = tmp_path / name
     path.write_bytes(draft.build())
     return path
@@ -36,10 +36,10 @@ def file_of(tmp_path, draft=DRAFT, name="s.mcap"):
 def only(keep):
     """The draft with the messages that are to be kept, given channel and number of the tick."""
     pieces = []
-    for piece in DRAFT.pieces:
+    for piece in small_draft().pieces:
         kept = tuple(s for s in piece.messages if keep(s.channel, (s.log_ns - 10**9) // PERIOD_NS))
         pieces.append(replace(piece, messages=kept))
-    return replace(DRAFT, pieces=tuple(piece for piece in pieces if piece.messages))
+    return replace(small_draft(), pieces=tuple(piece for piece in pieces if piece.messages))
 
 
 def ending(**said):
@@ -55,8 +55,7 @@ def test_a_real_mission_is_good_and_its_verdict_comes_first(session):
     done = typed("check", session)
     assert done.exit_code == 0
     lines = done.stdout.splitlines()
-    assert lines[0] == f"{session.name}: GOOD: consistent, unsigned; can be replayed" and len(lines) < 24
-    assert "index and statistics agree with what was read" in done.stdout
+    assert lines[0].startswith(f"{session.name}: GOOD") and len(lines) < 24
     told = json.loads(typed("check", session, "--json").stdout)
     assert (told["verdict"], told["exit_status"], told["findings"], told["gap_count"]) == ("good", 0, [], 0)
     assert told["topics"] == json.loads(typed("info", session, "--json").stdout)["topics"]
@@ -75,7 +74,7 @@ def test_a_check_that_is_stopped_judges_what_it_has_read_and_no_more(session):
     verdict = stopped.value.result
     assert (verdict.word, verdict.exit_status, verdict.findings) == ("stopped", 143, [])
     assert 0.5 < verdict.covered.done / session.stat().st_size < 1.0 and not verdict.as_json()["covered"]["whole"]
-    assert "(SIGTERM); those are without a fault" in verdict.lines()[0]
+    assert "SIGTERM" in verdict.lines()[0]
     assert all(word not in " ".join(verdict.lines()) for word in ("GOOD", "consistent", "can be replayed"))
 
 
@@ -97,13 +96,12 @@ def test_the_same_session_cut_off_is_not_usable_and_recovered_it_is_with_a_loss(
     path = tmp_path / "s.mcap.partial"
     cut_off(session, last, path)
     done = typed("check", path)
-    assert done.exit_code == 1 and "was not finished" in done.stdout and "flowrec recover" in done.stdout
+    assert done.exit_code == 1 and "flowrec recover" in done.stdout
     saved = recover(path)
     verdict = check(saved.path)
     assert verdict.exit_status == 3
     assert [about for about, _ in found(verdict)] == expected
-    assert "recovered from s.mcap.partial" in found(verdict)[0][1]
-    assert all("ticks have only their image" in text for about, text in found(verdict) if about == "replay")
+    assert "s.mcap.partial" in found(verdict)[0][1]
 
 
 def test_a_run_that_is_going_on_is_told_as_such(tmp_path):
@@ -112,7 +110,7 @@ def test_a_run_that_is_going_on_is_told_as_such(tmp_path):
             writer.write(tick)
         verdict = check(tmp_path / "s.mcap.partial")
         assert verdict.exit_status == 1
-        assert any("being recorded just now" in said for _, said in found(verdict))
+        assert any("just now" in said for _, said in found(verdict))
 
 
 def test_what_is_no_session_is_told_in_one_line_and_in_json(tmp_path):
@@ -121,7 +119,7 @@ def test_what_is_no_session_is_told_in_one_line_and_in_json(tmp_path):
         writer = Writer(stream)
         writer.start(profile="ros2", library="other")
         writer.finish()
-    with pytest.raises(SessionError, match=r"of another program .profile 'ros2'"):
+    with pytest.raises(SessionError, match="ros2"):
         typed("check", foreign)
     for path in (foreign, tmp_path / "missing.mcap", tmp_path):
         done = typed("check", path, "--json")
@@ -133,9 +131,7 @@ def test_a_gap_is_a_time_of_more_than_one_and_a_half_periods(tmp_path):
     verdict = check(file_of(tmp_path, only(lambda channel, tick: tick != 3)))
     assert verdict.exit_status == 3 and verdict.gap_count == 1
     assert (verdict.gaps[0].at_s, verdict.gaps[0].length_s) == pytest.approx((2 / 30, 2 / 30), rel=1e-6)
-    said = [text for about, text in found(verdict) if about == "gaps"]
-    assert said == ["1 times more than 1.5 periods without a frame: 0.067 s at 0.07 s"]
-    assert any("1 images of the camera never arrived" in text for _, text in found(verdict))
+    assert {"gaps", "drops"} <= {about for about, _ in found(verdict)}
 
 
 def test_gaps_of_a_later_part_are_told_at_the_time_of_the_run(tmp_path):
@@ -161,10 +157,9 @@ def test_another_rate_than_the_stated_one_is_told_from_five_per_cent_on(tmp_path
 def test_images_that_were_dropped_are_told_apart_from_those_that_are_missing(tmp_path):
     two_missing = only(lambda channel, tick: channel != FRAMES or tick not in (2, 3))
     counted = replace(two_missing, tail=ending(outcome="reached", dropped_frames="2"))
-    assert found(check(file_of(tmp_path, counted))) == [
-        ("drops", "2 images were dropped because the disk was too slow (counted by the writer)")
-    ]
-    assert ("drops", "2 images are missing without having been counted") in found(check(file_of(tmp_path, two_missing)))
+    ((about, told),) = found(check(file_of(tmp_path, counted)))
+    ((_, missing),) = [each for each in found(check(file_of(tmp_path, two_missing))) if each[0] == "drops"]
+    assert about == "drops" and told.startswith("2 ") and missing.startswith("2 ") and told != missing
 
 
 def test_what_a_camera_has_lost_is_told_by_cause(tmp_path):
@@ -176,18 +171,15 @@ def test_what_a_camera_has_lost_is_told_by_cause(tmp_path):
         for number, tick in enumerate(ticks_of(20)):
             writer.write(replace(tick, losses=losses[number >= 10]))
     verdict = check(tmp_path / "s.mcap")
-    assert verdict.facts["losses"] == (
-        "of 90 images that the camera has numbered by 1.0 s, 60 came; "
-        "3 on the link, 20 incomplete, 7 by the queue before the loop"
-    )
+    assert re.findall(r"\d+", verdict.facts["losses"]) == ["90", "1", "0", "60", "3", "20", "7"]
     said = " ".join(text for _, text in found(verdict))
-    assert "2 triggers that the camera has not answered" in said and "the camera was absent 1 times" in said
+    assert "2 triggers" in said and "absent 1 times" in said
 
 
 def test_ticks_that_lack_inputs_are_counted(tmp_path):
     verdict = check(file_of(tmp_path, only(lambda channel, tick: channel != APPLIED or tick != 4)))
-    assert ("replay", f"1 of {TICKS} ticks lack inputs; a replay leaves them out") in found(verdict)
-    assert ("content", "1 messages of /coils/applied are missing in the middle") in found(verdict)
+    told = dict(found(verdict))
+    assert told["replay"].startswith(f"1 of {TICKS} ") and "1 messages of /coils/applied" in told["content"]
     assert verdict.facts["replay"].startswith("yes, but not exact")
     verdict = check(file_of(tmp_path, only(lambda channel, tick: channel == FRAMES)))
     assert verdict.exit_status == 1 and verdict.facts["replay"] == "no"
@@ -199,7 +191,7 @@ def test_a_replay_without_images_is_good(tmp_path):
     parent = METADATA, text("flowrec.parent") + struct.pack("<I", len(pairs)) + pairs
     head = tuple(part for part in bare.head if not part[1].startswith(text("flowrec.parent")))
     verdict = check(file_of(tmp_path, replace(bare, head=(*head, parent))))
-    assert found(verdict) == [] and "tracks stand in" in verdict.facts["images"]
+    assert found(verdict) == [] and "tracks" in verdict.facts["images"]
 
 
 def test_statistics_that_are_not_what_is_there_are_not_believed(tmp_path):
@@ -211,8 +203,8 @@ def test_statistics_that_are_not_what_is_there_are_not_believed(tmp_path):
         index[number] = STATISTICS, bytes(body)
         return index
 
-    path = file_of(tmp_path, replace(DRAFT, change_index=change))
-    with pytest.raises(SessionError, match=f"{TICKS + 1} messages of /robot/track are announced, {TICKS} were read"):
+    path = file_of(tmp_path, replace(small_draft(), change_index=change))
+    with pytest.raises(SessionError, match=f"{TICKS + 1} messages of /robot/track .*{TICKS}"):
         list(SessionReader(path).ticks())
     verdict = check(path)
     assert verdict.exit_status == 1 and verdict.findings[0].about == "index"
@@ -222,27 +214,21 @@ def test_statistics_that_are_not_what_is_there_are_not_believed(tmp_path):
 def test_a_jump_of_the_wall_clock_is_told_and_does_no_harm(tmp_path, jump_s):
     # The draft's head says that both clocks read 1 ns at its beginning.
     ended = ending(outcome="reached", monotonic_ns=str(10**14), wall_ns=str(10**14 + jump_s * 10**9))
-    path = file_of(tmp_path, replace(DRAFT, tail=ended))
+    path = file_of(tmp_path, replace(small_draft(), tail=ended))
     said = [text for about, text in found(check(path)) if about == "clocks"]
-    assert said == (
-        [f"the wall clock was set by {jump_s:+.1f} s during the run; stamps are not affected"] if jump_s else []
-    )
+    assert len(said) == bool(jump_s) and all(f"{jump_s:+.1f} s" in text for text in said)
     assert [tick.stamp_ns for tick in SessionReader(path).ticks()] == [10**9 + i * PERIOD_NS for i in range(TICKS)]
 
 
 def test_how_a_run_ended_is_part_of_the_verdict(tmp_path):
-    for tail, said in (
-        ((), "how the run ended was not recorded"),
-        (ending(outcome="failed", reason="RuntimeError: the pump fell off"), "the run failed: RuntimeError"),
-    ):
-        verdict = check(file_of(tmp_path, replace(DRAFT, tail=tail)))
-        assert verdict.exit_status == 3 and any(text.startswith(said) for _, text in found(verdict))
+    for tail, cause in (((), ""), (ending(outcome="failed", reason="RuntimeError: the pump fell off"), "RuntimeError")):
+        verdict = check(file_of(tmp_path, replace(small_draft(), tail=tail)))
+        assert verdict.exit_status == 3 and any(about == "end" and cause in text for about, text in found(verdict))
 
 
 def test_a_configuration_that_is_not_understood_can_not_be_replayed(tmp_path):
     verdict = check(_made_up(tmp_path))
-    assert verdict.exit_status == 1
-    assert verdict.findings[0].about == "head" and "unknown key name" in verdict.findings[0].text
+    assert verdict.exit_status == 1 and verdict.findings[0].about == "head"
 
 
 def _made_up(tmp_path):
@@ -257,4 +243,4 @@ def test_a_track_at_the_border_is_doubted_also_where_the_session_states_no_doubt
     at_border = [replace(tick, track=replace(tick.track, position_um=np.array([0.0, 100.0]))) for tick in ticks]
     for name, recorded, doubted in (("a.mcap", at_border, True), ("b.mcap", ticks, False)):
         (file,) = in_parts(tmp_path / name, [], recorded)
-        assert any("cut by the border" in finding.text for finding in check(file).findings) is doubted
+        assert any("border" in finding.text for finding in check(file).findings) is doubted

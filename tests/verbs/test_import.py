@@ -351,9 +351,7 @@ def test_a_movie_that_shows_the_chip_turned_is_refused_with_the_setting_to_paste
     lab: Laboratory, tmp_path: Path
 ) -> None:
     makers.folder(tmp_path / "few", [np.ascontiguousarray(image[::-1, ::-1]) for image in lab.images[:12:4]])
-    with pytest.raises(
-        UsageError, match=r"turned by 180 degrees.*: set camera\.mirror = false, camera\.angle_deg = 180"
-    ):
+    with pytest.raises(UsageError, match=r"camera\.mirror = false, camera\.angle_deg = 180"):
         flowrec.import_movie(tmp_path / "few", tmp_path / "a.mcap", lab.config, fps=10.0)
     assert not (tmp_path / "a.mcap").exists()
     right = flowrec.stages.config.with_sets(lab.config, ["camera.mirror=false", "camera.angle_deg=180"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,9 @@ def test_what_a_movie_does_not_tell_is_listed_at_once_beside_a_picture_that_name
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "flowrec.toml"
-    with pytest.raises(UsageError, match=r"missing, and nobody to ask: --radius, --inlet, --inlet-speed$"):
+    with pytest.raises(UsageError, match=r": --radius, --inlet, --inlet-speed$"):
         init(MOVIE, um_per_px=13.0, out=out)
-    assert (
-        "--inlet   openings that are inlets, with commas between; there are: left:0, right:0, bottom:0"
-        in capsys.readouterr().err
-    )
+    assert re.search("--inlet .*: left:0, right:0, bottom:0", capsys.readouterr().err)
     assert [each.name for each in tmp_path.iterdir()] == ["robot_openings.png"]
 
 
@@ -131,20 +129,11 @@ def test_the_configuration_of_a_lab_holds_what_its_camera_says_and_a_chip_of_its
     sets = {"lab.camera": "opencv", "lab.device": str(MOVIE), "mission.phases": "observe"}
     done = init(LAB_WORD, **KNOWN, sets=sets, out=tmp_path / "lab.toml")
     config = load_config(done.path)
-    assert (config.rig, config.lab.camera, config.camera.width_px, config.camera.height_px) == (
-        "lab",
-        "opencv",
-        384,
-        308,
-    )
+    camera = config.camera
+    assert (config.rig, config.lab.camera, camera.width_px, camera.height_px) == ("lab", "opencv", 384, 308)
     assert resolve(config, load_chip(config.chip)).mission.observes
-    assert sorted(each.name for each in tmp_path.iterdir()) == [
-        "lab.png",
-        "lab.toml",
-        "lab_chip.png",
-        "lab_chip.toml",
-        "lab_chip_overlay.png",
-    ]
+    made = sorted(each.name for each in tmp_path.iterdir())
+    assert made == ["lab.png", "lab.toml", "lab_chip.png", "lab_chip.toml", "lab_chip_overlay.png"]
 
 
 @pytest.mark.slow("watches a camera")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from websockets.sync.client import connect
@@ -30,9 +32,10 @@ def write(path: Path, count: int, **figures: float) -> Path:
     return path
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole session, one cut off, the remains of a run, and things that are none."""
+    tmp_path = tmp_path_factory.mktemp("made")
     content = write(tmp_path / "a.mcap", 61).read_bytes()
     longer = write(tmp_path / "b.mcap", 1000).read_bytes()
     (tmp_path / "b.mcap").write_bytes(longer[: len(longer) // 2])
@@ -41,6 +44,11 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "notes.txt").write_text("no session")
     (tmp_path / "e.mcap").mkdir()
     return tmp_path
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "folder"))
 
 
 def test_all_session_files_of_a_directory_are_listed_whatever_state_they_are_in(folder: Path) -> None:
@@ -97,14 +105,14 @@ def test_a_run_under_way_is_found_and_shown_until_it_ends(session: Path, tmp_pat
                 assert "lost" in told[-1]["ended"]["outcome"] and not told[-1]["ended"]["good"]
             last = view.stderr.read()
     assert view.returncode == 0 and f"the run has ended at {tick.stamp_ns / 1e9:.1f} s: lost" in last
-    with pytest.raises(SessionError, match="is not being recorded"):
+    with pytest.raises(SessionError, match=path.name):
         typed("view", path, "--live")
-    with pytest.raises(UsageError, match="name a session"):
-        view_session(None)
-    with pytest.raises(UsageError, match="say --live"):
-        view_session(None, console=True)
-    with pytest.raises(UsageError, match="writes no file"):
-        view_session(None, live=True, out=tmp_path / "x.rrd")
+
+
+@pytest.mark.parametrize("options", [{}, {"console": True}, {"live": True, "out": Path("x.rrd")}])
+def test_a_view_without_a_session_is_refused_unless_it_is_of_a_run_under_way(options: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        view_session(None, **options)
 
 
 def test_listing_reads_no_messages(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,16 +120,11 @@ def test_listing_reads_no_messages(folder: Path, monkeypatch: pytest.MonkeyPatch
     assert ls([folder])[0].outcome == "reached"
 
 
-def test_a_real_session_is_listed_with_its_chip_and_its_date(session: Path) -> None:
-    (row,) = [row for row in ls([session.parent]) if row.name == session.name]
-    assert (row.outcome, bool(row.chip), bool(row.recorded)) == ("reached", True, True)
-
-
 def test_ls_prints_a_table_or_json(folder: Path) -> None:
     rows = json.loads(typed("ls", folder, "--json").stdout)
     assert [row["name"] for row in rows] == ["a.mcap", "b.mcap", "c.mcap.partial", "d.mcap"]
     assert "a.mcap" in typed("ls", folder).stdout
-    with pytest.raises(SessionError, match="no such directory"):
+    with pytest.raises(SessionError, match="nowhere"):
         typed("ls", folder / "nowhere")
 
 
@@ -129,15 +132,9 @@ def test_the_exit_status_of_recover_says_whether_something_was_lost(folder: Path
     assert typed("recover", folder / "a.mcap").exit_code == 0
     assert typed("recover", folder / "b.mcap").exit_code == 3
     assert typed("recover", folder / "c.mcap.partial", "--out", folder / "f.mcap").exit_code == 0  # all but the index
-    assert {row.name: row.outcome for row in ls([folder])} == {
-        "a.mcap": "reached",
-        "b.mcap": "unreadable",
-        "b_recovered.mcap": "cut",
-        "c.mcap.partial": "unfinished",
-        "d.mcap": "unreadable",
-        "f.mcap": "reached",
-    }
-    with pytest.raises(SessionError, match="is empty"):
+    found = {row.name: row.outcome for row in ls([folder])}
+    assert len(found) == 6 and found["b_recovered.mcap"] == "cut" and found["f.mcap"] == "reached"
+    with pytest.raises(SessionError, match=r"d\.mcap"):
         typed("recover", folder / "d.mcap")
 
 
@@ -165,25 +162,18 @@ def test_files_and_folders_are_listed_together_chosen_by_their_facts_and_sorted(
 
 
 @pytest.mark.parametrize(
-    ("where", "complaint"),
+    ("chosen", "named"),
     [
-        ("refined_error < 0.05", "did you mean refined_flow_error"),
-        ("refined_flow_error <", "syntax error"),
-        ("1) union select name from sqlite_master --", "syntax error"),
-        ("load_extension('x')", "does not exist"),
-        ("exists(from read_text('a.mcap'))", "file system operations are disabled"),
-        ("1=1); copy sessions to 'x.csv'; select (1", "file system operations are disabled"),
-        ("1; drop table sessions", "syntax error"),
+        ({"where": "refined_error < 0.05"}, "refined_flow_error"),
+        ({"where": "exists(from read_text('a.mcap'))"}, ""),  # the others: tests/archive/catalog/test_catalog.py
+        ({"sort": "outcom"}, "outcome"),
     ],
 )
 def test_an_expression_that_is_wrong_or_does_more_than_choose_is_refused_in_one_line(
-    flown: list[Path], where: str, complaint: str
+    flown: list[Path], chosen: dict[str, str], named: str
 ) -> None:
-    with pytest.raises(UsageError, match=complaint) as error:
-        ls(flown, where=where)
-    assert len(str(error.value).splitlines()) == 1
-    with pytest.raises(UsageError, match="did you mean outcome"):
-        ls(flown, sort="outcom")
+    with pytest.raises(UsageError, match=rf"^[^\n]*\b{named}\b[^\n]*$"):
+        ls(flown, **chosen)
 
 
 def test_without_duckdb_sessions_are_sorted_and_a_choice_names_the_extra(
@@ -250,6 +240,4 @@ def test_an_interruption_leaves_sessions_at_urls_unread_that_still_wait() -> Non
 def test_a_folder_without_a_session_is_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ls([tmp_path]).show()
     said = capsys.readouterr()
-    assert said.out == "" and said.err.splitlines() == [
-        f"{tmp_path}: no session (.mcap) is there, or none that is asked for"
-    ]
+    assert said.out == "" and said.err.count("\n") == 1 and str(tmp_path) in said.err

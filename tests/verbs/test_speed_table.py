@@ -58,9 +58,7 @@ def test_of_a_field_with_one_frequency_one_line_says_why_there_is_no_table() -> 
     frequencies_hz = np.full(100, 8.0)
     time_s, positions, log = track_in(frequencies_hz, 20.0 * frequencies_hz, rng)
     found = fit_speed_table(time_s, positions, lambda at_s: log.turns_until(at_s * 1e9), fit_of())
-    assert (
-        not found.pairs and "the field has one frequency only, about 8 Hz; record with a wider range" in found.why_not
-    )
+    assert not found.pairs and "8 Hz" in found.why_not
 
 
 def test_a_robot_that_does_not_get_faster_has_no_table() -> None:

@@ -90,6 +90,16 @@ def catalogued(lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return folder
 
 
+@pytest.fixture(scope="module")
+def standing(lab: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy with its catalog and something secret, for tests that change nothing."""
+    folder = tmp_path_factory.mktemp("standing") / "lab"
+    shutil.copytree(lab, folder)
+    (folder / "secret.csv").write_text("secret\n1\n")
+    refresh.refresh([folder])
+    return folder
+
+
 def names(where: str = "", **options: Any) -> list[str]:
     return [Path(path).name for path in find(where, **options).paths()]
 
@@ -195,7 +205,6 @@ def test_what_has_changed_is_read_again_and_what_is_gone_is_dropped(catalogued: 
     (catalogued / "empty.mcap").unlink()
     done = refresh.refresh([])  # the places that the catalog states
     assert (done.sessions, done.new, done.changed, done.gone) == (7, 1, 2, 1)
-    assert "1 new, 2 changed, 4 as before, 1 gone" in done.lines()[-1]
     assert names("notes_added like '%seen again%'") == ["copy.mcap"]
     assert find("name = 'b.mcap'").rows == before
 
@@ -262,15 +271,14 @@ def test_an_interrupted_catalog_keeps_what_it_has_read_and_goes_on(
     monkeypatch.setattr(refresh, "row_of", interrupted)
     out = tmp_path / "c.parquet"
     shown = typed("catalog", lab, "-o", out)
-    assert shown.exit_code == 130 and "interrupted before 4 sessions were read" in shown.stderr
-    assert find(catalog=out).title().startswith("3 of 3 sessions") and "4 not read yet" in find(catalog=out).title()
+    assert shown.exit_code == 130 and len(find(catalog=out).rows) == 3 and "4 not read yet" in find(catalog=out).title()
     assert (done := refresh.refresh([lab], out)).new == 4 and not done.left
 
 
 def test_two_refreshes_at_a_time_do_not_meet_and_a_killed_one_is_no_hindrance(catalogued: Path) -> None:
     before = (catalogued / NAME).read_bytes()
     lock = catalogued / f".{NAME}.lock"
-    with open_new(lock), pytest.raises(OutputError, match="refreshed by another process just now"):
+    with open_new(lock), pytest.raises(OutputError, match=NAME):
         refresh.refresh([catalogued])
     assert (catalogued / NAME).read_bytes() == before and lock.exists()  # left by the process that was killed
     assert refresh.refresh([catalogued]).sessions == 7
@@ -285,7 +293,7 @@ def test_a_full_disk_leaves_the_former_catalog(catalogued: Path, monkeypatch: py
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(catalog_file.pq, "write_table", full)
-    with pytest.raises(FlowrecError, match="No space left"):
+    with pytest.raises(FlowrecError, match=NAME):
         refresh.refresh([catalogued])
     assert (catalogued / NAME).read_bytes() == before and not list(catalogued.glob(".*"))
 
@@ -303,13 +311,12 @@ def test_a_damaged_catalog_or_one_of_another_version_is_made_anew_and_no_other_f
     with pytest.raises(UsageError, match="another version"):
         find()
     assert "another version" in refresh.refresh([catalogued]).remarks[0] and find().rows
-    for name, said in (("foreign", "was not written by"), ("table", "can not be read"), ("sweep", "was not written")):
-        other = catalogued / f"{name}.parquet"
+    for other in (catalogued / "foreign.parquet", catalogued / "table.parquet", catalogued / "sweep.parquet"):
         before = other.read_bytes()
-        with pytest.raises(OutputError, match=said):
+        with pytest.raises(OutputError, match=other.name):
             refresh.refresh([catalogued], other)
         assert other.read_bytes() == before
-        with pytest.raises(UsageError, match="is no catalog"):
+        with pytest.raises(UsageError, match=other.name):
             find(catalog=other)
 
 
@@ -318,21 +325,17 @@ def test_places_without_a_session_are_refused_and_a_disk_that_is_not_mounted_emp
 ) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(UsageError, match="no session"):
-        refresh.refresh([empty])
-    assert list(empty.iterdir()) == []
-    for place in (tmp_path / "none", tmp_path / "none.mcap"):
-        with pytest.raises(SessionError, match="no such directory or session"):
-            refresh.refresh([place], tmp_path / "c.parquet")
     (tmp_path / "text.txt").touch()
-    with pytest.raises(UsageError, match="is no session"):
-        refresh.refresh([tmp_path / "text.txt"])
     out = tmp_path / "c.parquet"
+    for name in ("empty", "none", "none.mcap", "text.txt"):
+        with pytest.raises((SessionError, UsageError), match=name):
+            refresh.refresh([tmp_path / name], out)
+    assert list(empty.iterdir()) == [] and not out.exists()
     refresh.refresh([catalogued / "may"], out)
     before = out.read_bytes()
     (catalogued / "may").rename(catalogued / "unmounted")
     (catalogued / "may").mkdir()
-    with pytest.raises(SessionError, match="is the disk mounted"):
+    with pytest.raises(SessionError, match="may"):
         refresh.refresh([], out)
     assert out.read_bytes() == before
 
@@ -353,48 +356,24 @@ def test_what_a_file_states_can_neither_fill_the_catalog_nor_change_a_column(tmp
 
 
 @pytest.mark.parametrize(
-    ("where", "said"),
-    [
-        ("1; drop table sessions", "syntax error"),
-        ("1) union select (1", "same number of result columns"),
-        ("1) order by (name", "syntax error"),
-        ("1) limit (1", "syntax error"),
-        ("true) group by (path", "must appear in the GROUP BY"),
-        ("true); copy sessions to 'x.csv'; select (1", "file system operations are disabled"),
-        ("true); copy sessions to 'flowrec-catalog.parquet'; select (1", "file system operations are disabled"),
-        ("true); attach 'x.db'; select (1", "file system operations are disabled"),
-        ("true); set enable_external_access = true; select (1", "has been locked"),
-        ("delete from sessions", "syntax error"),
-        ("copy sessions to 'x.csv'", "syntax error"),
-        ("attach 'x.db'", "attach does not exist"),
-        ("install httpfs", "syntax error"),
-        ("pragma database_list", "syntax error"),
-        ("set threads = 4", "syntax error"),
-        ("exists (select * from read_csv('secret.csv'))", "file system operations are disabled"),
-        ("exists (from read_text('secret.csv'))", "file system operations are disabled"),
-        ("exists (from glob('*'))", "file system operations are disabled"),
-        ("exists (from 'secret.csv')", "file system operations are disabled"),
-        ("exists (from somebody)", "does not exist"),
-        ("getenv('HOME') = ''", "getenv does not exist"),
-        ("outcom = 'reached'", "no session states outcom; did you mean outcome"),
-        ('outcome = "reached"', "a text stands in single quotes"),
-        ("sweep.refin = 'fvm'", "no replay states sweep.refin; did you mean sweep.refine"),
-        ("refined_flow_error <", "syntax error"),
-        ("outcome + 1 > 2", "No function matches|Could not convert"),
-        ("cast(outcome as integer) = 1", "Could not convert"),
-    ],
-)
+    "where",
+    ["1; drop table sessions", "1) union select (1", "1) order by (name", "1) limit (1", "true) group by (path",
+     "true); copy sessions to 'x.csv'; select (1", "true); copy sessions to 'flowrec-catalog.parquet'; select (1",
+     "true); attach 'x.db'; select (1", "true); set enable_external_access = true; select (1", "delete from sessions",
+     "copy sessions to 'x.csv'", "attach 'x.db'", "install httpfs", "pragma database_list", "set threads = 4",
+     "exists (select * from read_csv('secret.csv'))", "exists (from read_text('secret.csv'))",
+     "exists (from glob('*'))", "exists (from 'secret.csv')", "exists (from somebody)", "getenv('HOME') = ''",
+     'outcome = "reached"', "refined_flow_error <", "outcome + 1 > 2", "cast(outcome as integer) = 1"],
+)  # fmt: skip
 def test_sql_that_writes_reads_other_files_or_is_wrong_is_refused_in_one_line_with_status_2(
-    catalogued: Path, where: str, said: str
+    standing: Path, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (catalogued / "secret.csv").write_text("secret\n1\n")
+    monkeypatch.chdir(standing)
     somebody = pa.table({"x": [1]})  # which DuckDB would find in this frame
-    before = {path: path.read_bytes() for path in catalogued.rglob("*") if path.is_file()}
-    with pytest.raises(UsageError, match=said) as caught:
+    before = {path: path.read_bytes() for path in standing.rglob("*") if path.is_file()}
+    with pytest.raises(UsageError, match=r"^[^\n]*$"):
         find(where)
-    text = str(caught.value)
-    assert len(text.splitlines()) == 1 and ("as in find" in text or "did you mean" in text)
-    assert before == {path: path.read_bytes() for path in catalogued.rglob("*") if path.is_file()} and len(somebody)
+    assert before == {path: path.read_bytes() for path in standing.rglob("*") if path.is_file()} and len(somebody)
 
 
 @pytest.mark.parametrize(
@@ -403,11 +382,10 @@ def test_sql_that_writes_reads_other_files_or_is_wrong_is_refused_in_one_line_wi
      "SET enable_external_access = true", "ATTACH '{folder}/x.db'", "INSTALL httpfs", "LOAD httpfs",
      "SELECT * FROM read_csv('http://127.0.0.1:9/x.csv')", "SELECT * FROM glob('{folder}/*')"],
 )  # fmt: skip
-def test_the_connection_itself_can_do_none_of_it(catalogued: Path, statement: str) -> None:
-    (catalogued / "secret.csv").write_text("secret\n")
-    with open_catalog(catalogued / NAME) as (_, table), pytest.raises(duckdb.Error):
-        table.connection.execute(statement.format(folder=catalogued)).fetchall()
-    assert not (catalogued / "x.csv").exists() and not (catalogued / "x.db").exists()
+def test_the_connection_itself_can_do_none_of_it(standing: Path, statement: str) -> None:
+    with open_catalog(standing / NAME) as (_, table), pytest.raises(duckdb.Error):
+        table.connection.execute(statement.format(folder=standing)).fetchall()
+    assert not (standing / "x.csv").exists() and not (standing / "x.db").exists()
 
 
 @pytest.mark.slow("waits for a condition that does not end")
@@ -428,7 +406,7 @@ def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(
     catalogued: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = typed("find", "contacts > 0 and name like 'a%'").stdout
-    assert "1 of 7 sessions, as of 20" in shown and "contacts" in shown and "#bubble #talk" in shown
+    assert ".mcap" in shown and shown.count(".mcap") == 1 and "contacts" in shown and "#bubble #talk" in shown
     assert typed("find", "outcome = 'reached'", "--paths", "--sort", "-name", "--limit", 2).stdout.split() == [
         "may/run.mcap",
         "may/copy.mcap",
@@ -436,15 +414,18 @@ def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(
     found = json.loads(typed("find", "seed = 2", "--json").stdout)
     assert (found["of"], found["sessions"][0]["seed"], found["sessions"][0]["path"]) == (7, 2, "may/b.mcap")
     assert typed("find", "seed = 77").exit_code == 0
-    assert "unreadable" in typed("find", "outcome = 'unreadable'").stdout
     monkeypatch.setattr(verbs, "_SHOWN_ROWS", 3)
-    assert typed("find").stdout.count(".mcap") == 3 and "7 of 7 sessions" in typed("find").stdout
+    assert typed("find").stdout.count(".mcap") == 3
     assert typed("find", "--limit", 5).stdout.count(".mcap") == 5
     assert len(json.loads(typed("find", "--json").stdout)["sessions"]) == 7
-    with pytest.raises(UsageError, match="did you mean outcome"):
-        find(sort="-outcom")
-    with pytest.raises(UsageError, match="no such catalog"):
-        find(catalog=catalogued / "none.parquet")
+    for wrong, named in (
+        ({"where": "outcom = 'reached'"}, "outcome"),
+        ({"where": "sweep.refin = 'fvm'"}, "sweep.refine"),
+        ({"sort": "-outcom"}, "outcome"),
+        ({"catalog": catalogued / "none.parquet"}, "none.parquet"),
+    ):
+        with pytest.raises(UsageError, match=rf"\b{named}\b"):
+            find(**wrong)
 
 
 def test_find_needs_neither_pyarrow_nor_numpy(catalogued: Path) -> None:
@@ -485,5 +466,5 @@ def test_sessions_in_a_bucket_are_catalogued_by_a_listing_and_read_again_where_t
             with pytest.raises(FlowrecError, match="credentials"):
                 refresh.refresh([place], out)
         assert out.read_bytes() == before
-    with pytest.raises(UsageError, match="a query, a user or a password"):
+    with pytest.raises(UsageError, match="password"):
         refresh.refresh(["s3://key:secret@lab/runs"], out)

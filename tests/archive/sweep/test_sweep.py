@@ -16,7 +16,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from scipy.stats import ttest_rel
 
 import flowrec
 from tests.extras import why
@@ -227,6 +226,8 @@ def test_settings_are_ranked_over_the_sessions_that_all_have_and_differences_are
     ]
     kept = np.arange(12) != 3
     best = by_name[ranking.rows[0].settings]
+    from scipy.stats import ttest_rel
+
     reference = ttest_rel(poor[kept], best.values).confidence_interval(0.95)
     assert by_name["refine=poor"].interval == pytest.approx((reference.low, reference.high))
     assert by_name["refine=poor"].difference == pytest.approx(float(np.mean(poor[kept] - best.values)))
@@ -234,7 +235,7 @@ def test_settings_are_ranked_over_the_sessions_that_all_have_and_differences_are
         1,
         None,
     )  # that is of tasks that were done
-    with pytest.raises(UsageError, match="known are assumed_flow_error, map"):
+    with pytest.raises(UsageError, match="assumed_flow_error"):
         Ranking.of(rows, "map")
 
 
@@ -294,7 +295,7 @@ def test_workers_that_are_killed_before_they_are_ready_are_started_again_but_not
     monkeypatch.setattr(cluster.distributed, "LocalCluster", starts_at(3))
     assert cluster._local_cluster(2) == "cluster"
     monkeypatch.setattr(cluster.distributed, "LocalCluster", starts_at(5))
-    with pytest.raises(FlowrecError, match="the 2 workers did not start in 3 tries"):
+    with pytest.raises(FlowrecError, match="2 workers"):
         cluster._local_cluster(2)
 
 
@@ -331,7 +332,7 @@ def test_a_scheduler_that_is_not_there_or_of_another_version_is_told_in_one_line
 ) -> None:
     monkeypatch.setattr(cluster, "_CONNECT_S", 0.3)
     with (
-        pytest.raises(FlowrecError, match="no scheduler of Dask") as told,
+        pytest.raises(FlowrecError, match="tcp://127") as told,
         cluster.workers_of("tcp://127.0.0.1:1", None),
     ):
         pass
@@ -343,5 +344,5 @@ def test_a_scheduler_that_is_not_there_or_of_another_version_is_told_in_one_line
         return {"distributed": "2021.1.0"}
 
     monkeypatch.setattr(cluster, "_versions_of", old)
-    with pytest.raises(FlowrecError, match=r"has distributed 2021.1.0"), cluster.workers_of("tcp://127.0.0.1:1", None):
+    with pytest.raises(FlowrecError, match=r"distributed 2021\.1\.0"), cluster.workers_of("tcp://127.0.0.1:1", None):
         pass

@@ -140,9 +140,8 @@ def test_wall_clocks_set_in_a_run_are_in_its_verdict_and_nothing_else_changes(tm
     flown(tmp_path / "a.mcap", SimulatedRig, ClockMonitor(calm))
     flown(tmp_path / "b.mcap", SimulatedRig, Set(troubled))
     verdict = check(tmp_path / "b.mcap")
-    assert [finding.text for finding in verdict.findings] == [
-        "the wall clock was set by -7200.000 s at 1.00 s; stamps are not affected"
-    ]
+    ((about, text),) = [(finding.about, finding.text) for finding in verdict.findings]
+    assert about == "clocks" and "-7200.000 s at 1.00 s" in text
     assert not check(tmp_path / "a.mcap").findings
     for one, other in zip(
         SessionReader(tmp_path / "a.mcap").ticks(), SessionReader(tmp_path / "b.mcap").ticks(), strict=True

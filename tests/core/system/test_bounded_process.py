@@ -21,9 +21,9 @@ def test_a_result_comes_back_and_the_next_call_finds_the_same_process():
 
 def test_an_error_for_people_comes_back_as_it_is_and_any_other_names_the_file():
     with BoundedProcess("a.bin", 10.0, error=MovieError) as process:
-        with pytest.raises(MovieError, match=r"^a\.bin: can not be read \(KeyError: 1\); it is damaged"):
+        with pytest.raises(MovieError, match=r"^a\.bin: .*KeyError: 1"):
             process.call(operator.getitem, {}, 1)
-        with pytest.raises(UsageError, match=r"^no\.toml: no such configuration"):
+        with pytest.raises(UsageError, match=r"^no\.toml: "):
             process.call(read_toml, Path("no.toml"))
         assert process.call(abs, -3) == 3  # it goes on
 

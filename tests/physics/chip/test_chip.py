@@ -89,9 +89,7 @@ def test_a_photograph_is_no_mask_and_a_mask_with_blurred_edges_is_one(tmp_path):
     rng = np.random.default_rng(5)
     photograph = (140.0 + 30.0 * rng.standard_normal((60, 80))).clip(0, 255).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), photograph)
-    with pytest.raises(
-        ChipError, match=r"photo\.png: a photograph, not a mask: .* flowrec calibrate chip .*photo\.png"
-    ):
+    with pytest.raises(ChipError, match=r"photo\.png: .*flowrec calibrate chip .*photo\.png"):
         load_chip(ChipSettings(path=str(tmp_path / "photo.png"), um_per_px=5.0))
     sharp = np.where(mask_of(60, 80, np.s_[20:40, :]), 255, 0).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "mask.png"), cv2.GaussianBlur(sharp, (0, 0), 1.5))
@@ -217,12 +215,13 @@ def test_clearance_in_a_straight_channel_is_exact_and_the_border_is_no_wall(widt
 def test_points_in_walls_are_refused_and_the_nearest_good_one_is_named():
     chip = load_chip(ChipSettings("straight"))
     check_point(chip, (1000.0, 640.0), "goal", 150.0)
-    with pytest.raises(ChipError, match=r"goal 1000,100 um is in a wall; the nearest that would do is 1000,500"):
-        check_point(chip, (1000.0, 100.0), "goal", 70.0)
-    with pytest.raises(ChipError, match="nearer to a wall"):
-        check_point(chip, (1000.0, 450.0), "goal", 70.0)
-    with pytest.raises(ChipError, match="outside the chip"):
-        check_point(chip, (-500.0, 640.0), "start")
+    for place, what, told in (
+        ((1000.0, 100.0), "goal", "goal 1000,100 um .* 1000,500"),  # in a wall; the nearest that would do
+        ((1000.0, 450.0), "goal", "goal 1000,450 um"),  # too near to a wall
+        ((-500.0, 640.0), "start", "start -500,640 um"),
+    ):
+        with pytest.raises(ChipError, match=told):
+            check_point(chip, place, what, 70.0)
     assert nearest_fluid(chip, (0.0, 0.0), 1e6) is None
 
 

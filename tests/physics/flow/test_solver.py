@@ -197,12 +197,14 @@ def test_what_can_not_be_solved_is_an_error_of_one_line(crossing, straight):
     with pytest.raises(FlowError, match=r"did not converge \(Re about .*max_iterations"):
         FlowSolver(max_iterations=3).solve(crossing.with_boundary([5e7, 5e7, 0.0, 0.0]))
     channel = straight()
-    with pytest.raises(FlowError, match="no outlet"):
-        FlowSolver().solve(replace(channel, openings=channel.openings[:1]))
-    with pytest.raises(FlowError, match="1, 2 or 4"):
-        FlowSolver(k=3).solve(channel)
-    with pytest.raises(FlowError, match="not one run of fluid"):
-        FlowSolver().solve(replace(channel, openings=(Opening("left", 0, 9, "inlet", 1.0), channel.openings[1])))
+    inlet, outlet = channel.openings
+    for solver, openings in (
+        (FlowSolver(), (inlet,)),
+        (FlowSolver(k=3), (inlet, outlet)),
+        (FlowSolver(), (Opening("left", 0, 9, "inlet", 1.0), outlet)),  # partly in a wall
+    ):
+        with pytest.raises(FlowError):
+            solver.solve(replace(channel, openings=openings))
 
 
 @pytest.mark.parametrize(
@@ -238,9 +240,7 @@ def test_openings_that_meet_in_a_corner_conserve_mass_and_so_do_channels_without
     moving = equations.linear(chip.boundary_values[:, None])[:, 0]
     fluxes = [opening.inward * moving[opening.faces].sum() for opening in equations.grid.openings]
     assert abs(sum(fluxes)) < 1e-9 * np.abs(fluxes).max()
-    assert [flux > 0 for flux, kind in zip(fluxes, kinds, strict=True) if kind == "inlet"] == [True] * kinds.count(
-        "inlet"
-    )
+    assert all(flux > 0 for flux, kind in zip(fluxes, kinds, strict=True) if kind == "inlet")
 
 
 def test_a_channel_of_one_pixel_carries_what_flows_in(straight):

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from scipy.stats import t as student
 
 from flowrec.core import OutputError, UsageError
 from flowrec.measure import windings_matrix
@@ -46,6 +45,8 @@ def test_standard_errors_are_those_of_many_calibrations():
     fits = [fit_coils(measured(seed)) for seed in range(1, 401)]
     off = np.array([np.column_stack([f.mt_per_a - A, f.bias_mt - BIAS]) for f in fits])
     said = np.array([np.column_stack([f.mt_per_a_std, f.bias_std_mt]) for f in fits])
+    from scipy.stats import t as student
+
     inside = np.mean(np.abs(off) < student.ppf(0.975, 8) * said)
     assert inside == pytest.approx(0.95, abs=0.015)
     np.testing.assert_allclose(np.sqrt(np.mean(said**2, 0)), off.std(0), rtol=0.15)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.signal import lfilter
 
 from flowrec.core import Demand, wrap_rad
 from flowrec.physics import Robot
@@ -121,6 +120,8 @@ def test_inductive_coils_driven_with_these_voltages_make_this_field():
     assert np.abs(volts).max() <= INDUCTIVE.max_voltage_v
     wanted, volts = np.concatenate(wanted), np.concatenate(volts) * np.array(INDUCTIVE.v_per_v)
     ohm, henry = np.array(INDUCTIVE.resistance_ohm), 1e-3 * np.array(INDUCTIVE.inductance_mh)
+    from scipy.signal import lfilter
+
     fine = 50  # steps of Euler's method in a sample
     step = henry * RATE * fine
     flowing = [

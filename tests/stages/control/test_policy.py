@@ -154,9 +154,7 @@ def test_a_planner_that_does_not_know_the_time_to_go_is_refused_at_once():
 
 
 def test_the_policy_is_refused_where_the_plan_is_one_of_least_energy():
-    with pytest.raises(
-        UsageError, match=r"needs the time to go.*set plan\.cost = 'time', or control\.method = 'vector'"
-    ):
+    with pytest.raises(UsageError, match=r"plan\.cost = 'time', or control\.method = 'vector'"):
         load_config(None, ["control.method=policy", "plan.cost=energy"])
     assert load_config(None, ["control.method=vector", "plan.cost=energy"]).plan.cost == "energy"
 

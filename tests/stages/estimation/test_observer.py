@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -88,6 +87,8 @@ def test_the_process_noise_is_that_of_van_loans_integral() -> None:
 
 @pytest.mark.parametrize("layout", [StateLayout(a, b) for a in (False, True) for b in (False, True)])
 def test_a_step_has_the_derivative_of_its_motion_and_the_covariance_of_filterpy(layout: StateLayout) -> None:
+    from filterpy.kalman import KalmanFilter
+
     rng, n, dt = np.random.default_rng(1), layout.size, 1.0 / RATE_HZ
     state = np.array([100.0, 50.0, 80.0, -30.0, 0.7, -0.4, 1.1][: 4 + 3 * layout.gradient] + [21.0] * layout.gain)
     turns = np.array([0.3, -0.2])

@@ -108,7 +108,9 @@ def test_the_options_of_a_row_are_settings_of_the_planner_and_fields_of_its_clas
 def test_an_unknown_method_is_an_error_everywhere():
     mask = open_water()
     world = field_of(mask, 0.0), (200.0, 250.0), (900.0, 600.0), chip_of(mask), robot()
-    with pytest.raises(UsageError, match=r"plan\.method = 'astar_tme': must be one of .*; the nearest is astar_time"):
-        Planner(method="astar_tme").plan(*world)
-    with pytest.raises(UsageError, match="the nearest is astar_time"):
-        load_config(None, ["plan.method=astar_tme"])
+    for call in (
+        lambda: Planner(method="astar_tme").plan(*world),
+        lambda: load_config(None, ["plan.method=astar_tme"]),
+    ):
+        with pytest.raises(UsageError, match=r"plan\.method = 'astar_tme'.* astar_time$"):
+            call()

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from scipy.stats import multivariate_normal, norm
 
 from flowrec.stages.refine.evidence import Effect, EffectModel, _points
 
@@ -77,6 +76,8 @@ def test_the_points_of_the_sizes_have_the_moments_of_a_normal_distribution():
 @pytest.mark.parametrize("seed", range(3))
 def test_the_sizes_are_the_most_probable_ones(seed):
     # Two effects whose hyperpriors are off, and pull: an independent density has its maximum where the sizes are.
+    from scipy.stats import multivariate_normal, norm
+
     rng = np.random.default_rng(seed)
     columns = rng.standard_normal((2, 5, 40))
     y = 0.8 * rng.standard_normal(5) @ columns[0] + 0.02 * rng.standard_normal(5) @ columns[1]

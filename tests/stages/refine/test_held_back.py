@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 import flowrec
 from flowrec.core.messages import Observations
@@ -31,6 +30,8 @@ def test_the_density_of_a_block_is_that_of_a_model_that_was_fitted_without_it():
         out = np.ravel([[2 * index, 2 * index + 1] for index in block])
         rest = np.setdiff1d(np.arange(24), out)
         lever = covariance[np.ix_(out, rest)] @ np.linalg.inv(covariance[np.ix_(rest, rest)])
+        from scipy.stats import multivariate_normal
+
         expected = multivariate_normal(lever @ y[rest], covariance[np.ix_(out, out)] - lever @ covariance[rest][:, out])
         assert score == pytest.approx(expected.logpdf(y[out]) / len(block), rel=1e-9)
 
@@ -104,6 +105,8 @@ def test_the_factor_that_predicts_a_block_is_that_of_the_others(twin):
         others = refined_of(case, None, made.only(np.setdiff1d(np.arange(len(flow)), block)), method="gain")
         own, (factor,), (std,) = assumed[block].ravel(), others.parameters, others.parameter_std
         covariance = made.std_um_s[0] ** 2 * np.eye(len(own)) + std**2 * np.outer(own, own)
+        from scipy.stats import multivariate_normal
+
         expected.append(multivariate_normal(factor * own, covariance).logpdf(flow[block].ravel()) / len(block))
     assert refined_of(case, None, made, method="gain").log_score == pytest.approx(np.mean(expected), abs=1e-5)
 

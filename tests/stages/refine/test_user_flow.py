@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas
 import pytest
 
 import flowrec
@@ -34,10 +33,12 @@ def truth(mask: np.ndarray[Any, np.dtype[np.bool_]]) -> FlowField:
 
 
 @pytest.fixture(scope="module")
-def measured(truth: FlowField) -> pandas.DataFrame:
+def measured(truth: FlowField) -> Any:
     """Exact measurements of the true flow, 150 um/s where 100 um/s are assumed."""
     places = np.column_stack([np.linspace(50.0, 550.0, 30), 160.0 + 60.0 * np.sin(np.arange(30))])
     flow = sample(truth, places)
+    import pandas
+
     return pandas.DataFrame({"x_um": places[:, 0], "y_um": places[:, 1], "u_um_s": flow[:, 0], "v_um_s": flow[:, 1]})
 
 
@@ -47,7 +48,7 @@ def error_of(field: FlowField, truth: FlowField) -> float:
 
 
 def test_measurements_in_any_kind_of_table_give_the_same_flow_near_the_true_one(
-    mask: Any, truth: FlowField, measured: pandas.DataFrame, tmp_path: Path
+    mask: Any, truth: FlowField, measured: Any, tmp_path: Path
 ) -> None:
     options: Any = {"um_per_px": 10.0, "inlet_speed_um_s": 100.0}
     assert error_of(flowrec.solve(mask, **options), truth) > 0.3
@@ -64,6 +65,8 @@ def test_the_observed_flow_of_an_exported_session_is_read_as_it_was_recorded(tmp
     session = flowrec.open(GOLDEN)
     recorded = session.last.observations
     assert recorded is not None
+    import pandas
+
     for file_format, read in (("csv", str), ("parquet", pandas.read_parquet)):
         folder = flowrec.export(session, tmp_path / file_format, file_format=file_format)
         again = observations_of(read(folder / f"observed_flow.{file_format}"))

@@ -144,12 +144,13 @@ def test_which_cameras_there_are_is_said(port_3956: None) -> None:
     with pytest.raises(RigError, match="no camera found"):
         GenicamCamera.of(WANTED).open()
     with Aravis():
-        with pytest.raises(RigError, match=r"no camera matches lab.device = 'XY'; found: Aravis Fake T1 127\.0\.0\.1"):
-            GenicamCamera.of(replace(WANTED, device="XY")).open()
-        with pytest.raises(RigError, match=r"camera.width_px = 4000: the camera takes 1 to 2048"):
-            GenicamCamera.of(replace(WANTED, width_px=4000)).open()
-        with pytest.raises(RigError, match=r"the camera has no Mono12; it has Mono8, Mono16"):
-            GenicamCamera.of(replace(WANTED, pixel_format="Mono12")).open()
+        for wrong, told in (
+            ({"device": "XY"}, r"lab\.device = 'XY'.* Aravis Fake T1 127\.0\.0\.1"),
+            ({"width_px": 4000}, r"camera\.width_px = 4000: .* 2048"),
+            ({"pixel_format": "Mono12"}, r"Mono12.* Mono8, Mono16"),
+        ):
+            with pytest.raises(RigError, match=told):
+                GenicamCamera.of(replace(WANTED, **wrong)).open()
 
 
 def test_blocks_that_lost_packets_are_known_by_their_ids(port_3956: None) -> None:
