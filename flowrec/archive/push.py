@@ -125,7 +125,7 @@ def push(sessions: Sequence[Path], target: str) -> Pushed:
                     pushed.files.append(done)
                     before += done.size_bytes
             except StoreError:
-                raise  # for the others it would be the same
+                raise  # the bucket can not be written: all others would fail likewise
             except SessionError as error:
                 pushed.failed[path] = str(error)
     return pushed

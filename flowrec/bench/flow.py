@@ -49,7 +49,7 @@ from flowrec.stages import REFINERS, Device, PiUnet, Refiner, Trimmed, with_row
 
 RANDOM_CASES = 10  # vessels that are made up where no folder of cases is given
 
-# The rows of REFINERS, of which fvm, no refinement, and gain are null models, and those of null_models.py. As in the
+# The rows of REFINERS and of null_models.py; fvm, which refines nothing, and gain are null models, too. As in the
 # paper, pi_unet starts from the solver's field. `:printed` has random weights and no other optimiser than the paper's.
 METHODS: dict[str, Refiner | NullModel] = {
     **{name: with_row(Refiner(pi_unet=PiUnet(start="fvm")), REFINERS, name) for name in REFINERS.usable()},
@@ -160,7 +160,7 @@ def measure(
 
 
 def _prepare() -> float:
-    """Import before anything is measured; the memory that this takes, MB."""
+    """Import torch before anything is measured; returns the peak memory of the process so far, MB."""
     import torch
 
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Null models of a refinement that share nothing with it: short, standard, and without any knowledge of what may fail.
+"""Null models of a refinement: short standard methods that share no code with it and model no cause of an error.
 
 modes : the sensitivities of the solver to its boundary values, the gain of the robot's own motion and an offset of the
     image, with Gaussian priors.
@@ -8,7 +8,7 @@ gp : a divergence-free Gaussian process (Narcowich and Ward 1994) for what one f
     length, size and share of the own motion by the largest evidence on a grid (Rasmussen and Williams 2006, 5.4.1).
 
 The first two are fitted by iteratively reweighted least squares with Huber's weights (1964); the noise is widened until
-the median residual is that of noise. What is left of the model's own error is a fixed share of the speed.
+the median residual is that of noise. What the model can not represent is a fixed share of the speed, LEFT_SHARE.
 """
 
 from __future__ import annotations
@@ -120,21 +120,21 @@ NULL_MODELS: dict[str, Callable[[FlowField, Observations, Chip, FlowSolver], tup
 
 
 def _at(image: NDArray[np.floating], assumed: FlowField, seen: Observations) -> Floats:
-    """(n, 2) a flow (h, w, 2) at the places of the observations."""
+    """A flow (h, w, 2) at the places of the observations, (n, 2)."""
     return sample(replace(assumed, velocity_um_s=image.astype(np.float32)), seen.position_um).astype(np.float64)
 
 
 def _prior_std(chip: Chip, drop_pa: float) -> Floats:
-    """(openings,) um/s or Pa."""
+    """Prior standard deviation of the value of each opening: um/s of an inlet, Pa of an outlet."""
     return np.array([INLET_SHARE * o.value if o.kind == "inlet" else OUTLET_SHARE * drop_pa for o in chip.openings])
 
 
 def _robust_fit(
     method: str, assumed: FlowField, seen: Observations, columns: Floats, um_per_px: float
 ) -> tuple[Floats, Floats, float]:
-    """Unknowns in prior std, their covariance at the stated noise, and by what factor the noise is wider.
+    """Unknowns in prior std, their covariance at the stated noise, and the factor by which the noise exceeds it.
 
-    `columns` (p, n, 2) are those of the flow; gain and offset follow.
+    `columns` (p, n, 2): effect of each unknown of the flow on the observations; those of gain and offset are appended.
     """
     there = _at(assumed.velocity_um_s, assumed, seen)
     also = []
@@ -163,7 +163,7 @@ def _robust_fit(
 def _resistor_flows(chip: Chip) -> tuple[Floats, Floats, float]:
     """Flow rates (n, 2) of the assumed inlets, those per unit of each opening (openings, n, 2), and the pressure drop.
 
-    In units in which a pixel of width 1 conducts 1.
+    All are in units in which a pixel of width 1 conducts 1.
     """
     mask = chip.mask
     clearance = scipy.ndimage.distance_transform_edt(np.pad(mask, 4, mode="edge"))[4:-4, 4:-4]

@@ -1,7 +1,7 @@
-"""`flowrec bench survey`: error of the assimilated flow with as many observations along different ways.
+"""`flowrec bench survey`: error of the assimilated flow by the places of its observations, whose number is the same.
 
-A case is read without its truth, which is read to make observations and to score the result. Only the ways of the
-survey are those of a robot that starts at the inlet and must still reach the outlet; the others say what is possible.
+A case is read without its truth, which is read to make observations and to score the result. A robot that starts at the
+inlet and must still reach the outlet can follow the ways of the survey planners only; the other ways are references.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from flowrec.stages import (
 )
 
 RANDOM_CASES = 20  # made up where no folder of cases is given
-_MOST_STRETCHES = 60  # of a way, after which a survey that has not seen enough is ended
+_MOST_STRETCHES = 60  # of a route; a survey that asks for more is ended
 Points = NDArray[np.float64]
 
 
@@ -64,7 +64,7 @@ class SurveyCase:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """The places of the observations, and how long a robot takes to see them; None: it can not be said."""
+    """The places of the observations, and the time that a robot needs for them, s; None: they are on no route."""
 
     places_um: Points
     seconds: float | None = None
@@ -83,7 +83,7 @@ def random(task: SurveyCase) -> Seen:
 
 
 def prior(task: SurveyCase) -> Seen:
-    """The places of the skeleton, one after the other, that lower the stated error of the map most."""
+    """Places of the skeleton, chosen one after another so that each lowers the stated error of the map most."""
     places = (np.argwhere(thin(task.chip.mask))[:, ::-1] * task.chip.um_per_px).astype(np.float64)
     return Seen(_best(task, places))
 
@@ -118,7 +118,7 @@ def place_information(
 
 
 def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Seen:
-    """Places along the way of a survey until it has had enough: evenly spread, or chosen, a pixel apart."""
+    """Places along the route of a survey: evenly spread, or with `choose` the best of those a mask pixel apart."""
     config = task.config
     start = np.array(config.mission.start)
     sampling = Sampling(2.0 * task.spacing_um, 0.0, task.noise_um_s)
@@ -148,7 +148,7 @@ def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Se
 
 
 def _extend_observations(before: Observations, now: Observations) -> Observations:
-    """The observations of a longer way: those of its first part have been made and stay as they are."""
+    """The observations along a route that was extended; those along its first part keep their flows."""
     flow = np.concatenate([before.flow_um_s, now.flow_um_s[len(before.flow_um_s) :]])
     return replace(now, flow_um_s=flow)
 

@@ -1,4 +1,4 @@
-"""One flight in a world, what a refinement would have been given in it, and how good each refinement is.
+"""Flies one mission in a simulated world, keeps the input of its refinement, and scores refinements of it.
 
 A flight is one mission in a simulated world. Its observations do not depend on how they are refined, so the work order
 of its survey is kept, and any method can refine it later without flying again.
@@ -49,9 +49,10 @@ from flowrec.verbs import refuse_adrift
 
 # Messages of a work order that are kept; the assumed flow is solved again.
 _KEPT = ("mission", "estimate", "health", "observations", "tracer_flow")
-_OTHERS = "others"  # and the observations of each of the other robots
-# Methods that are `assimilate` with a part of what was observed, where tracers or other robots were followed.
-OF_A_PART: Mapping[str, Mapping[str, Any]] = {  # and what is left out
+_OTHERS = "others"  # key of the observations of the other robots, which are kept too
+# Methods that are `assimilate` with a part of the observations, for flights with tracers or other robots: the fields of
+# the work order that are replaced.
+OF_A_PART: Mapping[str, Mapping[str, Any]] = {
     "robot_alone": {"tracer_flow": None, "extra": NO_EXTRA},
     "tracers_alone": {"observations": None, "extra": NO_EXTRA},
 }
@@ -134,8 +135,8 @@ class Flight:
     outcome, note : of the mission; `refused` before anything was driven.
     contacts : wall contacts, also those of the survey.
     seconds : from the first frame to the last.
-    truth : what was drawn.
-    drift : the flow during the survey over the steady one, by the drift of the pump.
+    truth : the deviations from the configuration that the seed drew, in words.
+    drift : ratio of the flow during the survey to the steady one, by the drift of the pump.
     order : messages of the last work order before the navigation that asked for a refinement; {} if there was none.
     refined : scores by method.
     code : version and commit that flew it.
@@ -239,7 +240,7 @@ def fly(case: FlightCase) -> Flight:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A refinement problem, the verb that solves it by a method, and what judges the result."""
+    """A refinement problem, the function that solves it by a named method, and the truth that scores the result."""
 
     assumed: FlowField
     refine_by: Callable[[str], FlowField]

@@ -35,7 +35,7 @@ class ProcessWorker:
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
-        self._fills: deque[str] = deque()  # fields of Tick that the results to come go to
+        self._fills: deque[str] = deque()  # fields of Tick for the results of the orders under way, the oldest first
         self._unsent: FlowrecError | None = None  # why an order was never sent
         self._orders: queue.SimpleQueue[Pipeline | Tick | None] = queue.SimpleQueue()
         self._orders.put(pipeline)
@@ -107,7 +107,7 @@ class ProcessWorker:
             self._unsent = FlowrecError(f"{_NAME} can not be sent an order ({_describe(error)})")
 
     def _log(self) -> str:
-        """Write the log file; the end of an error text that names it."""
+        """Write the log file, and return the end of an error text that names it."""
         if not self._child.printed:
             return "it printed nothing; is memory short?"
         try:

@@ -1,4 +1,4 @@
-"""Session -> ticks and images, whether it is one file or a run in parts."""
+"""Reads a session, one file or a run in parts, as ticks, messages and images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flowrec.store.run_files import Run
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.session_path import session_path
 
-_OPEN_FILES = 4
+_OPEN_FILES = 4  # of a run in parts, at a time
 
 
 class SessionReader(Closing):
@@ -68,7 +68,7 @@ class SessionReader(Closing):
 
     @functools.cached_property
     def _fields(self) -> list[set[str]]:
-        """The topics of each file by field."""
+        """For each file the fields of Tick of which it has messages."""
         return [{topic.field for topic in self.topics.topics if topic.path in file.counts} for file in self._run.files]
 
     @functools.cached_property
@@ -83,7 +83,7 @@ class SessionReader(Closing):
         return {known[path].field: count for path, count in self._run.counts().items() if path in known}
 
     def coils_of(self, fields: Iterable[str]) -> int:
-        """Number of coils, as the first message about them has it, if the tables of some topics need it; else 3."""
+        """Number of coils by the first message about them, if a table of these topics has columns by coil; else 3."""
         kinds: list[Any] = [self.topics.by_field[field].type for field in fields]
         return self._coils if any(COILS in lengths for kind in kinds for _, lengths in array_shapes(kind)) else 3
 
@@ -223,7 +223,7 @@ class SessionReader(Closing):
         raise SessionError(f"{self.path}: has no image at {stamp_ns} ns")
 
     def close(self) -> None:
-        """Close the session; forgotten readers close theirs when they are collected."""
+        """Close the files that are kept open; one that is kept no longer is closed when it is collected."""
         self._closed = True
         for file in self._open.values():
             file.close()

@@ -129,7 +129,7 @@ def last_line(log: str) -> str:
 
 
 def leave(process: subprocess.Popen[bytes]) -> None:
-    """Let a process outlive this one; if it ends before, it leaves no entry in the table of processes."""
+    """Let a process outlive this one; if it ends earlier, its exit status is collected."""
     threading.Thread(target=process.wait, name="outlives", daemon=True).start()
 
 

@@ -1,6 +1,6 @@
-"""`flowrec catalog --serve`: the sessions that a condition finds, for Rerun, by its own catalog server.
+"""`flowrec catalog --serve`: Rerun's own catalog server shows the sessions that a condition finds.
 
-The server takes .rrd files only. They are made when they are asked for, kept beside the catalog in a hidden folder, and
+The server takes .rrd files only. They are made before it starts, kept beside the catalog in a hidden folder, and
 removed when a later call serves others: the folder holds what was served last.
 """
 
@@ -19,7 +19,7 @@ from flowrec.store import Session, input_blamed
 from flowrec.view import DATASET, is_made_from, serve_recordings
 
 FOLDER = ".flowrec-rrd"
-SERVED_LIMIT = 50  # sessions; each takes seconds to convert, and twice its size
+SERVED_LIMIT = 50  # sessions; each takes seconds to convert, and twice its size on the disk
 
 
 def serve(catalog: Path, where: str, port: int | None) -> None:

@@ -42,7 +42,7 @@ class Ranking:
 
     figure: str  # by which they are ranked; '' where no task has one
     sessions: int  # the number of sessions with that figure in every setting: the common sessions
-    of_sessions: int  # of how many
+    of_sessions: int  # the number of all sessions
     rows: tuple[Ranked, ...]
 
     @classmethod
@@ -71,14 +71,14 @@ class Ranking:
         found.sort(key=lambda each: np.mean(each[1]) if each[1] else math.inf)
         best = found[0][1] if found else []
         ranked = []
-        for number, (text, of_sessions) in enumerate(found):
+        for number, (text, own_values) in enumerate(found):
             own = by_settings.get(text, {}).values()
             cpu_s = [row["cpu_s"] for row in own if row.get("cpu_s") is not None and not row.get("error")]
-            mean = float(np.mean(of_sessions)) if of_sessions else None
-            difference, interval = _paired_difference(of_sessions, best) if number and of_sessions else (None, None)
+            mean = float(np.mean(own_values)) if own_values else None
+            difference, interval = _paired_difference(own_values, best) if number and own_values else (None, None)
             failed = sum(bool(row.get("error")) for row in own)
-            of_tasks = float(np.mean(cpu_s)) if cpu_s else None
-            ranked.append(Ranked(text, mean, difference, interval, tuple(of_sessions), failed, of_tasks))
+            mean_cpu_s = float(np.mean(cpu_s)) if cpu_s else None
+            ranked.append(Ranked(text, mean, difference, interval, tuple(own_values), failed, mean_cpu_s))
         return cls(figure, len(common), len(contents), tuple(ranked))
 
     def cells(self) -> tuple[list[str], list[list[str]]]:

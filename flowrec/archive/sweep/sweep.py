@@ -26,8 +26,9 @@ class Swept:
     Attributes
     ----------
     path : the Parquet file.
-    tasks, computed : all of this call, and those that were not done before.
-    sessions, unreadable : that were swept; files that are no whole sessions.
+    tasks, computed : number of the tasks of this call, and of those that were not done before.
+    sessions : number of sessions that were swept.
+    unreadable : number of files that are no whole sessions.
     rows : of all tasks of this call that are done.
     ranking : of the settings.
     """
@@ -99,7 +100,7 @@ def sweep(
     out : the Parquet file; one of an earlier sweep of these sessions is continued.
     sets : texts `key=value` that hold for all replays.
     refly : fly the recorded and the replayed plan, too, as `flowrec replay --refly`.
-    by : the figure by which settings are ranked; None: the first of RANKED_BY.
+    by : the figure by which settings are ranked; None: the first of RANKED_BY that a row has.
     retry : do tasks again that have failed.
     scheduler, workers : of Dask; see `workers_of`.
     timeout_s, memory_bytes : limits of a task.
@@ -138,7 +139,7 @@ def sweep(
 
 
 def _packages(path: Path, chosen: Sequence[Settings]) -> dict[Settings, str]:
-    """The packages of others that each of the settings uses; UsageError for one that no replay takes."""
+    """The outside packages that each of the settings uses, as JSON; UsageError for settings that no replay takes."""
     session = Session(path)
     found: dict[Settings, str] = {}
     for settings in chosen:
@@ -151,7 +152,7 @@ def _packages(path: Path, chosen: Sequence[Settings]) -> dict[Settings, str]:
 
 
 def _judged_once(tasks: Sequence[Task], judged: set[str]) -> Iterator[Task]:
-    """The tasks, of which the first of each session checks it where its verdict is not known."""
+    """The tasks; the first one of each session whose verdict is not known also checks the session."""
     known = set(judged)
     for task in tasks:
         yield replace(task, judge=task.content not in known)

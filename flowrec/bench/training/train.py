@@ -56,7 +56,8 @@ def train(
     """Train on the lessons in `folder`, which are made if missing, and write the best weights to `out`.
 
     Returns the steps, training losses and validation errors (mean relative RMSE of the velocity), the error before the
-    refinement (`before`), the least one (`best`) and the CPU time in s. `report` gets a line of text at each of them.
+    refinement (`before`), the least one (`best`) and the CPU time in s. `report` is called with a line of text at each
+    validation.
 
     Raises
     ------

@@ -23,7 +23,7 @@ class Walls:
     box: Box
 
     def for_shift(self, shift_px: tuple[float, float]) -> Walls:
-        """The walls in an image that lies `shift_px` (columns, rows) farther."""
+        """The walls in an image that is shifted by `shift_px` (columns, rows)."""
         (x, y), (height, width), (x0, y0, x1, y1) = shift_px, self.distance_px.shape, self.box
         to_image = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
         distance = cv2.warpAffine(self.distance_px, to_image, (width, height), borderMode=cv2.BORDER_REPLICATE)
@@ -34,7 +34,7 @@ class Walls:
 
 @lru_cache(maxsize=4)
 def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, ...]) -> Walls:
-    """Walls of a chip (compared by identity) in an image of `shape` (rows, columns)."""
+    """Walls of a chip in an image of `shape` (rows, columns); cached by the identity of the chip."""
     height, width = shape
     scale = calibration.um_per_px / chip.um_per_px  # mask pixels per camera pixel
     to_mask = calibration.matrix / chip.um_per_px  # of (column, row, 1) in the image
