@@ -194,7 +194,7 @@ SCORE = {"within_2_sigma": 0.9, "crps": 0.01, "warned": False, "expected": None,
 
 def test_wrong_requests_are_said_at_once(tmp_path):
     for wrong in ({"worlds": "mars"}, {"methods": "luck"}):
-        with pytest.raises(UsageError, match="mars|luck"):
+        with pytest.raises(UsageError, match=r"mars|luck"):
             worlds.measure(**wrong)
     (tmp_path / "rows.jsonl").write_text("{}\n{}\n")
     with pytest.raises(UsageError, match=r"line 1: is no flight"):

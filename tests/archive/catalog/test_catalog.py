@@ -91,13 +91,19 @@ def catalogued(lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 @pytest.fixture(scope="module")
-def standing(lab: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy with its catalog and something secret, for tests that change nothing."""
+def _standing(lab: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("standing") / "lab"
     shutil.copytree(lab, folder)
     (folder / "secret.csv").write_text("secret\n1\n")
     refresh.refresh([folder])
     return folder
+
+
+@pytest.fixture
+def standing(_standing: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """One such copy for all tests that change nothing; with a secret."""
+    monkeypatch.chdir(_standing)
+    return _standing
 
 
 def names(where: str = "", **options: Any) -> list[str]:
@@ -127,10 +133,10 @@ def test_every_session_is_a_row_whatever_its_state_and_is_read_once(
     assert (again.sessions, again.new, again.changed, again.gone, again.broken) == (7, 0, 0, 0, 3)
 
 
-def test_two_processes_write_the_same_rows_as_one(catalogued: Path, tmp_path: Path) -> None:
-    found = refresh.refresh([catalogued], tmp_path / "two.parquet", jobs=2)
+def test_two_processes_write_the_same_rows_as_one(standing: Path, tmp_path: Path) -> None:
+    found = refresh.refresh([standing], tmp_path / "two.parquet", jobs=2)
     assert (found.sessions, found.new, found.broken) == (7, 7, 3)
-    one, two = (find(catalog=path).as_json()["sessions"] for path in (catalogued / NAME, tmp_path / "two.parquet"))
+    one, two = (find(catalog=path).as_json()["sessions"] for path in (standing / NAME, tmp_path / "two.parquet"))
     assert [{**row, "path": row["name"]} for row in one] == [{**row, "path": row["name"]} for row in two]
 
 
@@ -141,13 +147,13 @@ def test_a_session_that_another_program_has_written_anew_has_the_same_content(la
     assert content_of(Session(written)) == content_of(Session(lab / "a.mcap"))
 
 
-def test_ls_and_find_have_the_same_columns_values_and_answers(catalogued: Path) -> None:
-    with open_catalog(catalogued / NAME) as (_, table):
+def test_ls_and_find_have_the_same_columns_values_and_answers(standing: Path) -> None:
+    with open_catalog(standing / NAME) as (_, table):
         known = {row["name"]: row for row in table.rows("")[1]}
         columns = table.columns
-    for place in (catalogued, catalogued / "may"):
+    for place in (standing, standing / "may"):
         for row in ls([place]):
-            listed = columns_of(row, (place / Path(row.name).name).relative_to(catalogued).as_posix())
+            listed = columns_of(row, (place / Path(row.name).name).relative_to(standing).as_posix())
             stated = {name: ", ".join(v) if isinstance(v, list) else v for name, v in listed.items()}
             assert stated == {name: known[Path(row.name).name].get(name) for name in stated}
             assert {name for name, value in stated.items() if value is not None} <= set(columns)
@@ -163,13 +169,13 @@ def test_ls_and_find_have_the_same_columns_values_and_answers(catalogued: Path) 
         "duration_s between 0.1 and 0.3 and seed in (1, 2)",
         "upper(outcome) = 'REACHED' and size_bytes > 10",
     ):
-        listed = [Path(row.name).name for row in ls([catalogued, catalogued / "may"], where=where)]
+        listed = [Path(row.name).name for row in ls([standing, standing / "may"], where=where)]
         assert sorted(listed) == sorted(names(where)), where
-    listed = [row.name for row in ls([catalogued], sort="-refined_flow_error")]
+    listed = [row.name for row in ls([standing], sort="-refined_flow_error")]
     assert listed[0] == "a.mcap" and names(sort="-refined_flow_error")[0] == "b.mcap"
 
 
-def test_replays_of_sweeps_and_marks_of_the_operator_are_found_with_their_sessions(catalogued: Path) -> None:
+def test_replays_of_sweeps_and_marks_of_the_operator_are_found_with_their_sessions(standing: Path) -> None:
     best = find("sweep.place = 1 and sweep.refine = 'pi_unet'")
     assert [Path(path).name for path in best.paths()] == ["a.mcap", "copy.mcap"]  # the same content
     assert best.mentioned == ["sweep.place", "sweep.refine"]
@@ -366,9 +372,8 @@ def test_what_a_file_states_can_neither_fill_the_catalog_nor_change_a_column(tmp
      'outcome = "reached"', "refined_flow_error <", "outcome + 1 > 2", "cast(outcome as integer) = 1"],
 )  # fmt: skip
 def test_sql_that_writes_reads_other_files_or_is_wrong_is_refused_in_one_line_with_status_2(
-    standing: Path, where: str, monkeypatch: pytest.MonkeyPatch
+    standing: Path, where: str
 ) -> None:
-    monkeypatch.chdir(standing)
     somebody = pa.table({"x": [1]})  # which DuckDB would find in this frame
     before = {path: path.read_bytes() for path in standing.rglob("*") if path.is_file()}
     with pytest.raises(UsageError, match=r"^[^\n]*$"):
@@ -403,7 +408,7 @@ def test_ctrl_c_ends_a_condition_that_does_not_end(catalogued: Path) -> None:
 
 
 def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(
-    catalogued: Path, monkeypatch: pytest.MonkeyPatch
+    standing: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = typed("find", "contacts > 0 and name like 'a%'").stdout
     assert ".mcap" in shown and shown.count(".mcap") == 1 and "contacts" in shown and "#bubble #talk" in shown
@@ -422,13 +427,13 @@ def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(
         ({"where": "outcom = 'reached'"}, "outcome"),
         ({"where": "sweep.refin = 'fvm'"}, "sweep.refine"),
         ({"sort": "-outcom"}, "outcome"),
-        ({"catalog": catalogued / "none.parquet"}, "none.parquet"),
+        ({"catalog": standing / "none.parquet"}, "none.parquet"),
     ):
         with pytest.raises(UsageError, match=rf"\b{named}\b"):
             find(**wrong)
 
 
-def test_find_needs_neither_pyarrow_nor_numpy(catalogued: Path) -> None:
+def test_find_needs_neither_pyarrow_nor_numpy(standing: Path) -> None:
     code = "import sys; sys.argv = ['flowrec', 'find', 'seed = 1', '--paths']\nfrom flowrec.verbs.cli import main\n"
     code += (
         "try:\n    main()\nexcept SystemExit:\n    print([m for m in ('pyarrow', 'numpy', 'mcap') if m in sys.modules])"
