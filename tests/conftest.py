@@ -167,7 +167,7 @@ def realtime_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     A replay that does not know when each was adopted would wait for 100 s.
     """
-    sets = [*SMALL, "survey.method=information", "survey.worth=0.03", "mission.phases=survey,refine,plan"]
+    sets = [*SMALL, "survey.method=information", "survey.worth=0.06", "mission.phases=survey,refine,plan"]
     sets += ["worker.adopt_after_s=100", "safety.guard_timeout_s=20"]
     return made_once(
         tmp_path_factory,

@@ -167,7 +167,7 @@ def test_a_finished_part_can_be_read_while_another_process_records_the_next_one(
             assert len(ticks) > 5
             assert all(isinstance(tick, Tick) for tick in ticks)
             assert session.at(session.last.stamp_ns / 1e9).stamp_ns == ticks[-1].stamp_ns
-        with pytest.raises(SessionError, match="being recorded just now"):
+        with pytest.raises(SessionError, match="just now"):
             flowrec.open(out)
     finally:
         process.terminate()
@@ -192,9 +192,9 @@ def test_what_a_session_holds_is_printed_for_people_and_a_misspelt_name_is_answe
     share = opened.fields["refined"].error_share
     assert share is not None and "flow by assimilate: 320 x 256 pixels of 20 um" in shown[1]
     assert shown[1].endswith(f"states an error of {100 * share:.1f} %>")
-    with pytest.raises(KeyError, match="no flow field 'refind'; there are 'assumed', 'refined', 'true'"):
+    with pytest.raises(KeyError, match=r"'refind'.* 'assumed', 'refined', 'true'"):
         opened.fields["refind"]
-    with pytest.raises(flowrec.FlowrecError, match="no topic 'trak'; did you mean 'track'"):
+    with pytest.raises(flowrec.FlowrecError, match=r"'trak'.* 'track'"):
         opened.table("trak")
     with pytest.raises(AttributeError) as caught:
         flowrec.opne  # noqa: B018

@@ -218,10 +218,10 @@ def test_a_change_in_an_extra_topic_is_found_by_check_compare_and_where_it_is_co
 
 
 def test_topics_that_can_not_be_recorded_together_are_refused_in_one_line(installed: Callable[[bool], None]) -> None:
-    with pytest.raises(UsageError, match=r"must be one of lab_pressure, .*; the nearest is lab_pressure"):
+    with pytest.raises(UsageError, match=r"lab_pressure$"):
         load_config(None, ['topics=["lab_pressur"]'])
     config = load_config(None, ['topics=["lab_pressure", "lab_pressure"]'])
-    with pytest.raises(UsageError, match="/pump/pressure: is declared twice"):
+    with pytest.raises(UsageError, match="/pump/pressure: "):
         topics_of(config)
 
 
@@ -229,10 +229,10 @@ def test_a_stage_that_returns_another_message_and_a_rig_with_an_undeclared_one_a
     installed: Callable[[bool], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mission = [text.replace('"lab_leak"', "") for text in MISSION]
-    with pytest.raises(RigError, match=r"/pump/leak: the rig has a message of this topic, which no row"):
+    with pytest.raises(RigError, match="/pump/leak: "):
         record(load_config(None, mission), tmp_path / "a.mcap")
     monkeypatch.setattr(LabMean, "step", lambda _self, _last, tick: Pressure(tick.stamp_ns, 1.0))
-    with pytest.raises(UsageError, match="/pump/mean: its stage returned a Pressure, where a Mean belongs"):
+    with pytest.raises(UsageError, match=r"/pump/mean: .* Pressure.* Mean"):
         record(load_config(None, MISSION), tmp_path / "b.mcap")
 
 

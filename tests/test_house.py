@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from tests.sources import PACKAGE, tree_of
+
 ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "flowrec"  # the sources: a wheel leaves some of them out
 GOLDEN = ROOT / "sessions" / "golden.mcap"
 
 
@@ -28,7 +29,7 @@ def arrows() -> list[tuple[Path, str, str, str]]:
 
 def _arrows() -> Iterator[tuple[Path, str, str, str]]:
     for path in sorted(PACKAGE.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("flowrec."):
                 _, other, *inner = str(node.module).split(".")
                 yield from ((path, other, ".".join(inner), each.name) for each in node.names)

@@ -6,9 +6,9 @@ import ast
 import re
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1] / "flowrec"
+from tests.sources import PACKAGE, tree_of
+
 LONGEST = 60  # lines of a function without its docstring
 QUESTION = re.compile(r"(Why|What|Of|The same|How|Whether|Where|When|Which|Who|Whose)\b")
 # A participle alone tells neither what a function does nor what it returns. A property may have one.
@@ -43,7 +43,7 @@ def definitions() -> list[tuple[str, ast.Module | ast.ClassDef | Function]]:
     return [
         (path.relative_to(PACKAGE).as_posix(), node)
         for path in sorted(PACKAGE.rglob("*.py"))
-        for node in within(ast.parse(path.read_text(encoding="utf-8")))
+        for node in within(tree_of(path))
     ]
 
 

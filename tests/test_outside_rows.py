@@ -220,7 +220,7 @@ def test_an_entry_point_that_is_no_row_is_refused_in_a_line_that_names_its_packa
 
 def test_a_stage_that_was_made_without_the_settings_of_its_package_says_so(entries: dict[str, dict[str, str]]) -> None:
     entries["flowrec.observers"] = {"lab": "LabObserver"}
-    with pytest.raises(UsageError, match=r"lab is of the package kit0 2, whose settings are not those given"):
+    with pytest.raises(UsageError, match="kit0 2"):
         Observer("lab").estimate(None, *[None] * 3)  # type: ignore[arg-type]
 
 
@@ -313,7 +313,7 @@ def test_a_camera_by_the_package_of_its_vendor_is_counted_and_opened_again_like_
     losses = frames[-1].losses
     assert (losses.link, losses.incomplete, losses.reconnections, acme.begun) == (1, 1, 1, 2)
     assert frames[1].clock is not None, "stamps are by the camera's clock"
-    with pytest.raises(RigError, match="knows no trigger"):
+    with pytest.raises(RigError, match="trigger"):
         AcmeCamera.of(replace(wanted, trigger="Line1")).open()
 
 

@@ -225,9 +225,9 @@ def test_a_session_without_images_or_with_regions_only_is_refused_in_one_line(se
     from dataclasses import replace
 
     monkeypatch.setitem(vars(session), "topics", {})
-    with pytest.raises(SessionError, match=r"golden.mcap: holds no camera images"):
+    with pytest.raises(SessionError, match=r"golden\.mcap"):
         written(mp4.Mp4Export(), session, tmp_path / "x.mp4")
     config = replace(session.config, recording=replace(session.config.recording, region="robot"))
     monkeypatch.setitem(vars(session), "config", config)
-    with pytest.raises(SessionError, match=r"only the region around the robot .* use --format mp4"):
+    with pytest.raises(SessionError, match="--format mp4"):
         written(mp4.PlainMp4Export(), session, tmp_path / "x.mp4")

@@ -67,7 +67,7 @@ def test_the_tracker_expects_the_walls_where_they_are(name):
 
 def test_a_run_whose_camera_shows_the_chip_turned_leaves_no_file_and_names_the_setting(tmp_path):
     config = load_config(None, [*SURVEY, "mission.check_axes=true", "simulated.angle_deg=180"])
-    with pytest.raises(ChipError, match=r"camera: the image shows the chip turned by 180 .*camera\.angle_deg = 180"):
+    with pytest.raises(ChipError, match=r"camera\.angle_deg = 180"):
         record(config, tmp_path / "turned.mcap")
     assert not list(tmp_path.iterdir())
 

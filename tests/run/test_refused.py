@@ -141,7 +141,7 @@ def test_what_a_fit_has_lost_is_found_before_scipy_is_given_it() -> None:
     lost = np.full((2, 2), np.nan)
     assert np.isfinite(likelihood.of_flow(still, known, still))
     for flow in ((lost, known, still), (still, lost[None], still), (still, known, lost)):
-        with pytest.raises(NotFiniteError, match="not finite at the observations"):
+        with pytest.raises(NotFiniteError, match="observations"):
             likelihood.of_flow(*flow)
     with pytest.raises(NotFiniteError):
         likelihood.gains(lost[None], np.ones((1, 1)))
@@ -193,5 +193,5 @@ def test_bad_settings_of_a_refinement_still_end_the_run(pipeline: Pipeline, know
         pressure_pa=known.assumed.pressure_pa[1:],
         wall_px=None,
     )
-    with pytest.raises(FlowrecError, match="solve the flow again for this chip"):
+    with pytest.raises(FlowrecError, match="chip"):
         work(pipeline, ordered(replace(other, assumed=smaller), "refine", "refine"))

@@ -289,7 +289,7 @@ def test_a_sender_that_is_not_there_is_refused_unless_it_is_only_noted() -> None
         def open(self) -> StreamHead:
             raise NoStreamError("no outlet")
 
-    with pytest.raises(RigError, match=r"streams\.pump: no outlet, within 0\.1 s"):
+    with pytest.raises(RigError, match=r"streams\.pump: .*0\.1 s"):
         reader_of(Absent(), wait_s=0.1, on_silence="hold")
     reader, told = reader_of(Absent(), wait_s=0.1)
     assert reader.state.gone and told == ["streams.pump: no outlet; the run begins without it"]

@@ -27,6 +27,7 @@ from flowrec.store import SessionReader
 from flowrec.verbs import prepare
 from flowrec.verbs.run_summary import Recorded
 from tests.conftest import run
+from tests.sources import PACKAGE, tree_of
 
 
 def test_a_configuration_survives_its_own_toml() -> None:
@@ -103,7 +104,6 @@ def test_a_goal_in_a_wall_or_outside_or_at_no_place_of_the_chip_is_refused() -> 
 
 
 KEY = re.compile(r"(?<![\w/.*{])([a-z_]{2,}(?:\.[a-z_0-9]+)+)")
-SOURCES = sorted(Path(flowrec.__file__).parent.rglob("*.py"))
 
 
 def keys(settings: object, prefix: str = "") -> set[str]:
@@ -117,7 +117,7 @@ def keys(settings: object, prefix: str = "") -> set[str]:
 def messages(source: Path) -> list[str]:
     """What is raised, warned of or said, as written in the source."""
     found = []
-    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(source)):
         called = getattr(node.func, "id", getattr(node.func, "attr", "")) if isinstance(node, ast.Call) else ""
         told = node.exc if isinstance(node, ast.Raise) else node if called in ("warn", "say", "bad", "odd") else None
         if told is not None:
@@ -127,7 +127,7 @@ def messages(source: Path) -> list[str]:
 
 def test_every_key_that_a_message_names_exists() -> None:
     known = keys(Config())
-    named = {key: text for source in SOURCES for text in messages(source) for key in KEY.findall(text)}
+    named = {key: text for source in PACKAGE.rglob("*.py") for text in messages(source) for key in KEY.findall(text)}
     assert len(named) > 20
     settings = {key: text for key, text in named.items() if not (key.startswith("flowrec.") or key.endswith(".py"))}
     assert {key: text for key, text in settings.items() if key not in known} == {}

@@ -53,7 +53,7 @@ def one_line(error):
 def test_an_existing_session_is_refused_before_anything_is_made(tmp_path):
     path = tmp_path / "s.mcap"
     path.write_bytes(b"precious")
-    with pytest.raises(SessionError, match=r"exists already.*--overwrite") as error:
+    with pytest.raises(SessionError, match="--overwrite") as error:
         SessionWriter(path, HEADER)
     assert one_line(error).startswith(str(path))
     assert names_in(tmp_path) == ["s.mcap"] and path.read_bytes() == b"precious"
@@ -70,7 +70,7 @@ def test_the_remains_of_an_unfinished_run_are_refused_as_well(tmp_path):
 
 
 def test_a_missing_directory_is_told_in_one_line(tmp_path):
-    with pytest.raises(SessionError, match="no such directory; make it") as error:
+    with pytest.raises(SessionError, match="missing") as error:
         SessionWriter(tmp_path / "missing" / "s.mcap", HEADER)
     one_line(error)
 
@@ -78,7 +78,7 @@ def test_a_missing_directory_is_told_in_one_line(tmp_path):
 def test_a_name_taken_during_the_run_is_not_overwritten(tmp_path):
     writer = SessionWriter(tmp_path / "s.mcap", HEADER)
     writer.path.write_bytes(b"precious")
-    with pytest.raises(SessionError, match=r"stays in .*s\.mcap\.partial"):
+    with pytest.raises(SessionError, match=r"s\.mcap\.partial"):
         writer.close()
     assert writer.path.read_bytes() == b"precious"
     assert SessionReader(writer.partial_path).outcome["outcome"] == "ended"

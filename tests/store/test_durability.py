@@ -306,7 +306,7 @@ def test_a_directory_that_disappears_ends_the_run(tmp_path):
             time.sleep(0.005)
 
     for call in (fly, writer.close):
-        with pytest.raises(SessionError, match=r"s\.mcap\.partial: no longer exists") as error:
+        with pytest.raises(SessionError, match=r"s\.mcap\.partial") as error:
             call()
         assert "\n" not in str(error.value)
 

@@ -112,7 +112,7 @@ def test_an_image_of_another_depth_than_the_session_is_refused_in_one_line(tmp_p
     for image, bits in ((np.zeros((2, 2), np.uint16), 8), (np.zeros((2, 2), np.uint8), 12), (np.zeros((2, 2)), 16)):
         with pytest.raises(RigError, match="it can not be kept exactly"):
             Frame(5, 7, image, bits)
-    with pytest.raises(RigError, match="an image of 9 bit; the depths are 8, 10, 12, 14, 16"):
+    with pytest.raises(RigError, match=r"9 bit.* 8, 10, 12, 14, 16"):
         Frame(5, 7, np.zeros((2, 2), np.uint16), 9)
 
 

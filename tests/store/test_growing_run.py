@@ -119,5 +119,5 @@ def test_runs_are_listed_while_they_are_recorded_and_only_those_can_be_watched(t
     lost.partial_path.unlink()  # as when its folder is removed: there is nothing to be watched
     assert lost.path not in [run.path for run in live_runs()]
     lost.discard()
-    with pytest.raises(SessionError, match="is not being recorded; `flowrec ls --live`"):
+    with pytest.raises(SessionError, match="flowrec ls --live"):
         GrowingRun(path)

@@ -168,7 +168,7 @@ def test_schemas_without_end_are_refused_before_all_are_read(tmp_path, where, mo
     refused(path, "more than 10000 records besides chunks")
     assert len(parsed) <= 2 * 10_000  # of the file, and of the file at a URL
     parsed.clear()
-    with pytest.raises(SessionError, match="more than 20000 records besides chunks"):
+    with pytest.raises(SessionError, match="20000"):
         check(path)
     assert len(parsed) <= 10_000 + 20_000
 

@@ -239,7 +239,7 @@ def test_a_disk_that_refuses_a_snapshot_is_an_error_of_the_run(tmp_path, monkeyp
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(McapWriter, method, refuse)
-    with pytest.raises(SessionError, match="the disk is full; free some space, then `flowrec recover"):
+    with pytest.raises(SessionError, match="flowrec recover"):
         record(tmp_path / "x.mcap", with_events((300, ("mark", ""))), sync_s=0.0)
 
 

@@ -327,14 +327,14 @@ def test_a_clock_that_goes_backwards_is_refused(tmp_path):
     with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
         writer.write(TICKS[1])
         for tick in (TICKS[1], TICKS[0], Tick(-1)):
-            with pytest.raises(SessionError, match="stamps of a session must grow"):
+            with pytest.raises(SessionError, match="stamps"):
                 writer.write(tick)
 
 
 def test_a_frame_that_can_not_be_stored_is_told_and_what_came_before_is_kept(tmp_path):
     writer = SessionWriter(tmp_path / "s.mcap", HEADER)
     writer.write(Tick(5, frame=Frame(5, -1, np.zeros((2, 2), np.uint8))))
-    with pytest.raises(SessionError, match=r"not in 32 bit; `flowrec recover .*s\.mcap\.partial`"):
+    with pytest.raises(SessionError, match=r"flowrec recover .*s\.mcap\.partial"):
         writer.close()
     assert not writer.path.exists() and writer.partial_path.exists()
 
@@ -380,5 +380,5 @@ def test_a_chunk_is_sealed_before_it_outgrows_what_a_reader_takes_and_no_message
         with SessionWriter(tmp_path / "y.mcap", HEADER, options) as other:
             other.write(next(ticks_of(1, shape=shape)))
 
-    with pytest.raises(SessionError, match=r"a message of /camera/frame has \d+ bytes, more than a chunk may hold"):
+    with pytest.raises(SessionError, match=r"/camera/frame .*\d+ bytes"):
         one((400, 300))

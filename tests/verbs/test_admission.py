@@ -50,7 +50,7 @@ def test_images_that_the_machine_does_not_hold_are_refused_before_there_is_a_fil
 def test_a_run_that_is_stopped_before_it_begins_leaves_no_file_and_says_so(tmp_path: Path) -> None:
     control = RunControl()
     control.stop("stopped by SIGTERM")
-    with pytest.raises(FlowrecError, match="SIGTERM, before the mission began; nothing was recorded") as refused:
+    with pytest.raises(FlowrecError, match="SIGTERM") as refused:
         record(load_config(None, SMALL), tmp_path / "never.mcap", control=Unattended(control))
     assert refused.value.exit_status in (130, 143) and not list(tmp_path.iterdir())
 

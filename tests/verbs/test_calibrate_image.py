@@ -69,7 +69,7 @@ def test_a_registration_goes_before_the_section_and_after_what_is_typed(registra
     assert load_config(path).camera.um_per_px < 21.0
     assert load_config(path, ["camera.um_per_px=30"]).camera.um_per_px == 30.0
     assert with_sets(load_config(), [f"camera.registration={registration}"]).camera.mirror
-    with pytest.raises(UsageError, match="is of images 320 x 256"):
+    with pytest.raises(UsageError, match="320 x 256"):
         load_config(path, ["camera.width_px=640"])
     path.write_text("[camera]\num_per_px = 1\n")
     with pytest.raises(UsageError, match="is no registration"):

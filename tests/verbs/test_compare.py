@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import make_dataclass, replace
 from pathlib import Path
 
@@ -130,7 +131,7 @@ def test_images_that_a_replay_did_not_copy_are_told_with_what_leaves_them_out(
     second = small_session(tmp_path / "b.mcap", [replace(tick, frame=None) for tick in ticks], parent=True)
     status, said = answered("compare", first, second)
     assert status == 3
-    assert "/camera/frame only in a.mcap, 20 messages" in " ".join(said.split())
+    assert re.search(r"/camera/frame\s.*a\.mcap, 20 ", said)
     assert "--ignore parent,/camera/frame leaves them out" in said
     status, said = answered("compare", first, second, "--ignore", "parent,/camera/frame,drawings")
     assert status == 0, said

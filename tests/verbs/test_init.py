@@ -97,7 +97,7 @@ def test_a_movie_without_a_channel_is_tracked(tmp_path: Path) -> None:
     places_um = track[["position_x_um", "position_y_um"]].to_numpy()
     assert track["seen"][: len(centres)].all()
     assert np.allclose(places_um[: len(centres)], 2.0 * np.array(centres), atol=0.4)
-    with pytest.raises(UsageError, match=r"--no-chip: chip\.path names a chip"):
+    with pytest.raises(UsageError, match=r"--no-chip: chip\.path"):
         init(folder, no_chip=True, sets={"chip.path": "mine.png"}, out=tmp_path / "b.toml")
 
 
@@ -120,7 +120,7 @@ def test_what_is_wrong_is_named_by_its_option_and_leaves_no_file(tmp_path: Path)
         init(MOVIE, **KNOWN, coils=log, out=out)
     assert [each.name for each in tmp_path.iterdir()] == ["log.csv"]
     cv2.imwrite(str(tmp_path / "dish.png"), np.full((120, 160), 128, np.uint8))
-    with pytest.raises(ChipError, match="where there is no channel, say --no-chip"):
+    with pytest.raises(ChipError, match="--no-chip"):
         init(tmp_path / "dish.png", **KNOWN, out=out)
 
 

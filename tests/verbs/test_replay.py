@@ -126,7 +126,7 @@ def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
 ) -> None:
     recorded = verb.adoption_stamps(SessionReader(realtime_session))
     out = tmp_path / "again.mcap"
-    done = verb.replay_session(realtime_session, Change(refine="assimilate", sets=("survey.worth=0.0301",)), out=out)
+    done = verb.replay_session(realtime_session, Change(refine="assimilate", sets=("survey.worth=0.0601",)), out=out)
     assert verb.adoption_stamps(SessionReader(out)) == recorded
     assert done.comparison.same
     assert computed == [*["survey_route"] * (len(recorded) - 3), "refine"]  # solved before, planned as was recorded
@@ -252,7 +252,7 @@ def test_a_survey_alone_can_be_refined_and_planned_afterwards(tmp_path: Path) ->
 
 
 def test_what_a_recording_has_settled_can_not_be_set(session: Path) -> None:
-    with pytest.raises(UsageError, match="can not change the camera"):
+    with pytest.raises(UsageError, match="camera"):
         verb.replay_session(session, Change(sets=("camera.rate_hz=60",)))
 
 

@@ -159,7 +159,7 @@ def test_robots_of_a_movie_are_named_by_numbers_of_its_picture(movie: tuple[Path
     for named in ((3, 1), (1, 2)):  # the two that stand out most, and others
         found = fit_import(asked, file.parent, [*map(str, named)], align=False).asked.tracker
         np.testing.assert_allclose(found.robots_px, [from_the_top[each - 1] for each in named], atol=1.0)
-    with pytest.raises(UsageError, match="--robot 7: there are 3 to choose from"):
+    with pytest.raises(UsageError, match=r"--robot 7: .* 3 "):
         fit_import(asked, file.parent, ["1", "7"], align=False)
 
 

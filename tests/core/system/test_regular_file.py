@@ -50,14 +50,14 @@ def pipe_at(path: Path) -> None:
 @pytest.mark.parametrize("name", READERS)
 def test_a_pipe_is_refused_before_it_is_opened(name, tmp_path):
     pipe_at(tmp_path / name)
-    with pytest.raises(FlowrecError, match=rf"{name}: is a pipe, and only files are read"):
+    with pytest.raises(FlowrecError, match=rf"{name}: is a pipe"):
         READERS[name](tmp_path / name)
 
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_link_to_a_device_that_never_ends_is_refused(name, tmp_path):
     (tmp_path / name).symlink_to("/dev/zero")
-    with pytest.raises(FlowrecError, match=rf"{name}: leads to /dev/zero, which is a device"):
+    with pytest.raises(FlowrecError, match=rf"{name}: .*/dev/zero"):
         READERS[name](tmp_path / name)
 
 

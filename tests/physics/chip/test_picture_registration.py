@@ -96,7 +96,7 @@ def test_walls_that_grey_levels_and_local_contrast_put_in_different_places_are_r
     assert np.hypot(*fit.apart[:2]) > 50.0
     assert (fit.std >= fit.apart).all()
     searched(truth)
-    with pytest.raises(ChipError, match="put vessels-3 in different places"):
+    with pytest.raises(ChipError, match="vessels-3"):
         register(image, VESSELS, ABOUT, (False,))
 
 
@@ -139,7 +139,7 @@ def test_a_straight_channel_does_not_tell_where_along_it_the_image_is(monkeypatc
     monkeypatch.setattr("flowrec.measure.picture_registration._CANDIDATES", 2)  # of a dozen that are all alike
     chip = load_chip(ChipSettings("straight"))
     _, image = seen("dark lines", 5.0, chip=chip)
-    with pytest.raises(ChipError, match="do not determine the shift along x"):
+    with pytest.raises(ChipError, match="along x"):
         register(image, chip, ABOUT, (False,))
 
 
@@ -149,7 +149,7 @@ def test_other_pictures_are_refused(monkeypatch):
     _, image = seen("dark lines", 5.0, chip=load_chip(ChipSettings("vessels", seed=5)))
     noise = np.random.default_rng(0).integers(0, 255, SIZE_PX[::-1]).astype(np.uint8)
     for other in (image, noise):
-        with pytest.raises(ChipError, match="does not show the chip vessels-3"):
+        with pytest.raises(ChipError, match="vessels-3"):
             register(other, VESSELS, ABOUT, (False,))
     with pytest.raises(ChipError, match="is blank"):
         register(np.full(SIZE_PX[::-1], 200, np.uint8), VESSELS, ABOUT)

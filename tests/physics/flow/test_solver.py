@@ -194,7 +194,7 @@ def test_the_same_chip_gives_the_same_bytes_with_or_without_the_cache(crossing):
 
 
 def test_what_can_not_be_solved_is_an_error_of_one_line(crossing, straight):
-    with pytest.raises(FlowError, match=r"did not converge \(Re about .*max_iterations"):
+    with pytest.raises(FlowError, match="max_iterations"):
         FlowSolver(max_iterations=3).solve(crossing.with_boundary([5e7, 5e7, 0.0, 0.0]))
     channel = straight()
     inlet, outlet = channel.openings

@@ -125,7 +125,7 @@ def test_a_recorder_whose_guardian_is_killed_takes_the_field_away_itself(on: Dev
     with driven(on, 0.4) as (drive, begin_ns, _):
         assert drive._guardian is not None and drive._guardian._process is not None
         drive._guardian._process.kill()
-        with pytest.raises(RigError, match="guardian process has ended"):
+        with pytest.raises(RigError, match="guardian"):
             commanded(drive)
         assert on.energised(begin) and on.off_ns(begin_ns, begin) is not None, "at once, not at the end of the run"
 
@@ -139,7 +139,7 @@ def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
         while time.monotonic() < begin_s + 1.0:
             drive.beat()
             time.sleep(0.01)
-        with pytest.raises(RigError, match="no beat of the loop for 100 ms"):
+        with pytest.raises(RigError, match="100 ms"):
             drive.apply(currents(5.0, 0.0))
     assert serial.off_ns(0, begin) is not None
 
@@ -152,7 +152,7 @@ def test_a_board_that_has_gone_to_zero_by_itself_ends_the_run(tmp_path: Path) ->
         drive.apply(currents(5.0, 0.0))
         until(on.energised)
         time.sleep(0.3)
-        with pytest.raises(RigError, match=r"has gone to zero by itself \(no line reached it in time\)"):
+        with pytest.raises(RigError, match="by itself"):
             commanded(drive)
         assert on.off_ns(0) is not None
 
@@ -289,7 +289,7 @@ def test_an_ni_output_whose_recorder_falls_silent_or_ends_goes_to_zero_without_a
 def test_a_guardian_that_can_not_act_does_not_start() -> None:
     read, write = os.pipe()
     os.close(read)
-    with pytest.raises(RigError, match=r"does not start: .*zero failed.*nothing is energised"):
+    with pytest.raises(RigError, match="zero failed"):
         Guardian(("serial", str(write)), (write,)).__enter__()
     os.close(write)
 

@@ -94,7 +94,7 @@ def test_a_guardian_that_does_not_answer_for_half_a_second_ends_the_run() -> Non
         clock.now_s += 0.499
         guardian.beat(energised=True)
         clock.now_s += 0.002
-        with pytest.raises(RigError, match=r"has not answered for 0\.5 s; the run ends"):
+        with pytest.raises(RigError, match=r"0\.5 s"):
             guardian.beat(energised=True)
         os.write(status, b"tripped no beat of the loop for 100 ms; zero confirmed in 3 ms\n")
         with pytest.raises(RigError, match="has switched the coils off: no beat"):

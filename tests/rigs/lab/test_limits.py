@@ -96,7 +96,7 @@ def test_samples_beyond_a_limit_or_that_are_no_numbers_are_refused_whoever_made_
     for spoil in (2.6, math.nan, -math.inf):
         with pytest.raises(RigError, match="current"):
             limits.check_samples(np.tile([0.0, spoil, 0.0], (3, 1)), none)
-    with pytest.raises(RigError, match=r"voltage of 11 V; the limit is 10 V"):
+    with pytest.raises(RigError, match=r"11 V.* 10 V"):
         limits.check_samples(rest, np.full((2, 3), 11.0))
     with pytest.raises(RigError, match="slew"):
         limits.check_samples(np.array([[0.0] * 3, [0.0] * 3, [0.2] * 3]), none)
@@ -123,7 +123,7 @@ def test_a_measured_current_that_differs_for_too_long_is_told_with_its_coil() ->
 def test_currents_that_nobody_measures_can_not_be_compared() -> None:
     asked = CommandLimits(CURRENT, ROBOT, OutputLimits(measured_within_a=0.1))
     info = AmplifierInfo("board", "", 9.0, 99.0, 1e6, 0.01, 0.1)
-    with pytest.raises(UsageError, match=r"measured_within_a = 0\.1: board measures no currents"):
+    with pytest.raises(UsageError, match=r"measured_within_a = 0\.1: board"):
         asked.check(info)
     asked.check(replace(info, measures=True))
 

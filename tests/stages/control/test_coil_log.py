@@ -67,7 +67,7 @@ def test_a_field_sampled_too_rarely_is_refused_and_noise_of_a_field_that_is_off_
     coils, header = Coils(), ["time_s", "b_x_mt", "b_y_mt", "b_z_mt"]
     _, times, field = motion(coils)
     slow = write(tmp_path / "slow.csv", header, np.column_stack([times, field])[::20])
-    with pytest.raises(MovieError, match=r"turns by 1\d\d degrees from .* its sense of rotation is not known"):
+    with pytest.raises(MovieError, match=r"1\d\d degrees"):
         read_coil_log(slow, Columns(), coils)
     field[250:] = np.random.default_rng(0).normal(0.0, 0.05, field[250:].shape)
     log = read_coil_log(write(tmp_path / "off.csv", header, np.column_stack([times, field])), Columns(), coils)

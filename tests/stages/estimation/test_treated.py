@@ -122,5 +122,5 @@ def test_any_treatment_keeps_observations_finite_and_no_more_of_them(method):
 
 
 def test_a_treatment_that_is_not_in_the_table_is_an_error():
-    with pytest.raises(UsageError, match=r"sampler\.method = 'trim': must be one of .*; the nearest is trimmed"):
+    with pytest.raises(UsageError, match=r"sampler\.method = 'trim': .* trimmed$"):
         Sampler(method="trim").treat(survey()[1])

@@ -155,7 +155,7 @@ def test_a_broken_field_a_foreign_field_and_a_robot_without_speed_are_errors():
         broken = type(field)(0, 0, "broken", PX, bad, field.pressure_pa, None, np.zeros(0), 1.0, 1000.0, "")
     with pytest.raises(FlowError, match="not finite"):
         Planner().plan(broken, START, GOAL, chip, robot())
-    with pytest.raises(UsageError, match="solve the flow on this chip"):
+    with pytest.raises(UsageError, match="chip"):
         Planner().plan(field_of(open_water(10, 10), 0.0), START, GOAL, chip, robot())
     with pytest.raises(UsageError, match="no speed"):
         Planner(speed_share=0.0).plan(field, START, GOAL, chip, robot())

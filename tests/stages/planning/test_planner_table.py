@@ -83,7 +83,7 @@ def test_the_same_problem_has_the_same_route(any_planner):
 
 def test_a_field_of_another_chip_is_an_error(any_planner):
     mask = open_water()
-    with pytest.raises(UsageError, match="solve the flow on this chip"):
+    with pytest.raises(UsageError, match="chip"):
         any_planner.plan(field_of(open_water(10, 10), 0.0), (200.0, 250.0), (900.0, 600.0), chip_of(mask), robot())
 
 
@@ -95,7 +95,7 @@ def test_what_a_row_says_of_time_to_go_and_energy_is_true(any_planner):
     if "cost" in row.options:
         assert thrifty.plan(*world).arrival_s[-1] > 1.5 * any_planner.plan(*world).arrival_s[-1]
     else:
-        with pytest.raises(UsageError, match=f"{row.name} knows no energy; .* method = 'time_field'"):
+        with pytest.raises(UsageError, match=f"{row.name} .*method = 'time_field'"):
             thrifty.plan(*world)
 
 

@@ -184,7 +184,7 @@ def test_observations_of_fluid_at_rest_leave_the_assumed_field_and_say_so(twin, 
 )
 def test_a_missing_gpu_is_an_error_of_one_line(twin, refiner):
     case = twin()
-    with pytest.raises(FlowError, match="sees no GPU: set it to 'cpu'"):
+    with pytest.raises(FlowError, match="'cpu'"):
         refiner.refine(case.assumed, case.observations, case.chip, case.solver)
 
 
@@ -229,7 +229,7 @@ def test_missing_and_damaged_weights_are_errors_of_one_line(twin, tmp_path):
         refine(tmp_path / "nowhere.safetensors")
     whole = path.read_bytes()
     (tmp_path / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FlowError, match="not a sound safetensors file"):
+    with pytest.raises(FlowError, match="safetensors"):
         refine(tmp_path / "cut.safetensors")
 
 

@@ -43,7 +43,7 @@ def test_walls_moved_by_an_offset_carry_the_same_flow_rate_in_the_parabola_of_th
 
 
 def test_an_offset_that_closes_an_opening_is_refused_with_its_size():
-    with pytest.raises(FlowError, match=r"walls moved by -6 px: an opening closes"):
+    with pytest.raises(FlowError, match="-6 px"):
         with_wall_offset(channel("pixel"), -6.0)
 
 

@@ -134,7 +134,7 @@ def test_what_is_asked_is_what_the_registers_of_aravis_hold(port_3956: None) -> 
 def test_a_camera_that_another_program_controls_is_busy(port_3956: None) -> None:
     with Aravis(), grabbing() as (grabber, _):
         frames_of(grabber, 1)
-        with pytest.raises(RigError, match=r"Aravis Fake T1 127\.0\.0\.1 is busy: another program controls it"):
+        with pytest.raises(RigError, match=r"Aravis Fake T1 127\.0\.0\.1 is busy"):
             GenicamCamera.of(WANTED).open()
         assert len(frames_of(grabber, 20)) == 20  # the one that has it is not disturbed
 

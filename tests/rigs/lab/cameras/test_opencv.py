@@ -108,7 +108,7 @@ def test_what_can_not_be_opened_is_one_line(change: dict[str, object], complaint
 def test_a_driver_that_refuses_its_settings_is_told_before_the_camera_could_have_answered() -> None:
     wanted = replace(WANTED, pixel_format="BayerRG8")
     began_s = time.monotonic()
-    with pytest.raises(RigError, match="must be one of Mono8"), Grabber(lambda: OpencvCamera.of(wanted), wanted):
+    with pytest.raises(RigError, match="Mono8"), Grabber(lambda: OpencvCamera.of(wanted), wanted):
         pass
     assert time.monotonic() < began_s + 10.0  # the grabber gives a camera 20 s to answer
 
@@ -118,7 +118,7 @@ def test_another_size_or_colours_are_said(tmp_path: Path) -> None:
     movie = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 25.0, (64, 48))
     movie.write(np.dstack([picture(10), picture(100), picture(200)]))
     movie.release()
-    with pytest.raises(RigError, match="have 64 x 48; set that"):
+    with pytest.raises(RigError, match="64 x 48"):
         OpencvCamera.of(replace(WANTED, device=str(path), width_px=32)).open()
     camera = OpencvCamera.of(replace(WANTED, device=str(path)))
     assert any("luminance" in note for note in camera.open().notes)
