@@ -31,10 +31,10 @@ def any_export(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first two seconds of the golden session: what is made of it again and again need not be long."""
+    """The first ticks of the golden session: what is made of it again and again need not be long."""
     path, session = tmp_path_factory.mktemp("brief") / "brief.mcap", flowrec.open(GOLDEN)
     with SessionWriter(path, session.header, WriterOptions(block=True)) as writer:
-        for tick in islice(session.ticks(), 30):
+        for tick in islice(session.ticks(), 10):
             writer.write(tick)
         writer.close({"outcome": "stopped"})
     return path

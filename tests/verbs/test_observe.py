@@ -19,7 +19,8 @@ from flowrec.verbs.check import check
 from flowrec.verbs.record import record
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.toml"
-OBSERVE = ("mission.phases=observe", "duration_s=3.0", "recording.own_process=false")
+DEPTH_AS_STATED = "refine.assimilate.doubt_depth=false"  # a third of the time
+OBSERVE = ("mission.phases=observe", "duration_s=3.0", "recording.own_process=false", DEPTH_AS_STATED)
 
 
 @pytest.fixture(scope="module")

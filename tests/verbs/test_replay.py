@@ -261,11 +261,6 @@ def test_verify_goes_without_changes(session: Path) -> None:
         verb.replay_session(session, Change(plan="astar_paper"), verify=True)
 
 
-def test_a_time_outside_the_session_is_refused(session: Path) -> None:
-    with pytest.raises(UsageError, match="runs from"):
-        verb.replay_session(session, Change(), from_s=1e6)
-
-
 def test_an_existing_output_is_not_overwritten(session: Path) -> None:
     with pytest.raises(SessionError, match="is read by this command"):
         verb.replay_session(session, Change(), out=session)

@@ -29,7 +29,7 @@ OBSERVED = [robot_topic("/robot/observations", number) for number in (1, 2)]
 
 def recorded(path: Path, *sets: str) -> Path:
     chosen = [word for each in (*SEVERAL, *sets) for word in ("--set", each)]
-    status, said = answered("record", *chosen, "--duration", 2, "--out", path)
+    status, said = answered("record", *chosen, "--duration", 1.5, "--out", path)
     assert status == 0, said
     return path
 
@@ -44,7 +44,7 @@ def verified(path: Path, *more: object) -> tuple[int, dict[str, Any]]:
     return status, json.loads(said)
 
 
-@pytest.mark.parametrize("more", [(), ("--from", 0.7)])
+@pytest.mark.parametrize("more", [(), ("--from", 0.4)])
 def test_a_replay_computes_all_robots_again_also_from_the_middle(mission: Path, more: tuple[object, ...]) -> None:
     status, found = verified(mission, *more)
     assert status == 0 and found["same"] is not False

@@ -102,7 +102,7 @@ def fields_of(path: Path, topic: str) -> list[str]:
         return [name for name, _ in leaves_of(parser_of(schema).FromString(message.data))]
 
 
-@pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.slow("rewrites a file for each value"))])
+@pytest.mark.parametrize("every", [12, pytest.param(1, marks=pytest.mark.slow("rewrites a file for each value"))])
 def test_every_value_of_a_message_is_under_the_digest(every: int, small: Path, tmp_path: Path) -> None:
     edited, seen = tmp_path / "edited.mcap", 0
     for topic in [*PATHS, *VIEWS]:
@@ -127,7 +127,7 @@ def test_every_value_of_a_message_is_under_the_digest(every: int, small: Path, t
 
 
 @pytest.mark.parametrize(
-    "names", [[*EDITS][::4], pytest.param([*EDITS], marks=pytest.mark.slow("rewrites a file for each of fifty edits"))]
+    "names", [[*EDITS][::6], pytest.param([*EDITS], marks=pytest.mark.slow("rewrites a file for each of fifty edits"))]
 )
 def test_an_edit_is_a_difference_and_check_never_says_more_than_it_knows(
     names: list[str], small: Path, tmp_path: Path
@@ -192,9 +192,8 @@ def test_every_record_of_the_head_is_under_the_digest(small: Path, tmp_path: Pat
 
         rewrite(small, tmp_path / "edited.mcap", None, edit_head)
         assert check(tmp_path / "edited.mcap").exit_status == 1
-        assert digest_findings(tmp_path / "edited.mcap") == [
-            "damaged or edited at the head (configuration, chip, origin or outcome)"
-        ], name
+        (finding,) = digest_findings(tmp_path / "edited.mcap")
+        assert finding.startswith("damaged or edited at the head"), name
 
 
 def test_what_is_declared_of_a_topic_is_under_the_digest(small: Path, tmp_path: Path) -> None:

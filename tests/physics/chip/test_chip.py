@@ -61,21 +61,16 @@ def test_a_chip_survives_its_two_files_exactly():
         assert same_chip(chip_from_files(*chip_files(chip)), chip)
 
 
-def test_the_widest_opening_on_the_left_is_taken_for_the_inlet():
-    mask = mask_of(40, 60, np.s_[4:8, :], np.s_[20:30, :], np.s_[8:20, 30:34])
-    openings = guess_inlets(find_openings(mask))
-    assert [(o.side, o.first, o.last, o.kind) for o in openings] == [
-        ("left", 4, 7, "outlet"),
-        ("left", 20, 29, "inlet"),
-        ("right", 4, 7, "outlet"),
-        ("right", 20, 29, "outlet"),
-    ]
-
-
-def test_without_an_opening_on_the_left_the_widest_of_all_is_the_inlet():
-    mask = mask_of(40, 60, np.s_[:, 10:14], np.s_[30:, 10:40], np.s_[0:30, 10:14])
-    openings = guess_inlets(find_openings(mask))
-    assert [(o.side, o.kind) for o in openings] == [("top", "outlet"), ("bottom", "inlet")]
+@pytest.mark.parametrize(
+    ("fluid", "inlet", "count"),
+    [
+        ((np.s_[4:8, :], np.s_[20:30, :], np.s_[8:20, 30:34]), ("left", 20, 29), 4),
+        ((np.s_[:, 10:14], np.s_[30:, 10:40], np.s_[0:30, 10:14]), ("bottom", 10, 39), 2),  # none is on the left
+    ],
+)
+def test_the_widest_opening_on_the_left_or_else_of_all_is_taken_for_the_inlet(fluid, inlet, count):
+    openings = guess_inlets(find_openings(mask_of(40, 60, *fluid)))
+    assert [(o.side, o.first, o.last) for o in openings if o.kind == "inlet"] == [inlet] and len(openings) == count
 
 
 def test_grazed_pixels_are_no_openings_and_a_corner_is_only_one():

@@ -3,9 +3,8 @@
 from dataclasses import fields, replace
 
 import numpy as np
-import pytest
 
-from flowrec.core import Demand, Route, UsageError
+from flowrec.core import Demand, Route
 from flowrec.physics import clearance_um
 from flowrec.stages import CONTROLLERS, Controller
 from tests.stages.control.plant import ROBOT, field_of, fly, mission, straight, vortex
@@ -55,11 +54,6 @@ def test_no_wall_is_touched_though_the_route_leads_into_it(any_controller):
     walls = (clearance_um(mask, 50.0), 50.0)
     run = fly(any_controller, into_wall, lambda x, y: (0.0, -30.0), 10.0, (500.0, 2500.0), None, clearance=walls)
     assert run.position_um[:, 1].min() - 1975.0 > 0.8 * ROBOT.radius_um
-
-
-def test_a_method_that_is_not_in_the_table_is_an_error_that_names_the_nearest():
-    with pytest.raises(UsageError, match=r"control\.method = 'polcy': .* policy$"):
-        fly(Controller(method="polcy"), route(), vortex, 0.1, START_UM, None)
 
 
 def test_the_options_of_each_row_are_settings_of_the_stage():

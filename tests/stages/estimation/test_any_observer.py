@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from flowrec.core import Estimate, UsageError
+from flowrec.core import Estimate
 from flowrec.stages import OBSERVERS, Observer
 from tests.stages.estimation.lap import ROBOT, driven, vortex
 
@@ -74,12 +74,6 @@ def test_after_three_seconds_the_error_of_the_flow_is_below_four_tenths(any_obse
     flows = np.array([estimate.flow_um_s for estimate in run.observed(any_observer, vortex())])
     error = np.hypot(*(flows[-10:] - run.flow_um_s[-10:]).T).mean()
     assert error < 0.4 * np.hypot(*run.flow_um_s[-10:].T).mean()
-
-
-def test_a_method_that_is_not_in_the_table_is_an_error_that_names_the_nearest():
-    run = short_lap()
-    with pytest.raises(UsageError, match=r"observer\.method = 'kalmann': .* kalman$"):
-        Observer("kalmann").estimate(None, run.tracks[0], run.applied[0], ROBOT)
 
 
 def test_the_option_of_each_row_is_the_section_of_its_settings():

@@ -234,8 +234,6 @@ def test_settings_that_make_no_sense_are_refused():
     ):
         with pytest.raises(UsageError, match=named):
             wrong.plan(*world)
-    with pytest.raises(UsageError):
-        Planner().plan(*world[:-1], robot(0.0))
 
 
 def test_a_wide_margin_asked_for_by_hand_names_the_narrowest_place():

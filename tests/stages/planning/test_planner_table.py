@@ -58,18 +58,19 @@ def test_more_clearance_is_kept_where_it_is_asked_for_and_where_the_flow_is_fast
 
 
 @pytest.mark.parametrize(
-    ("goal", "flow", "reason"),
+    ("start", "goal", "flow", "reason"),
     [
-        ((1000.0, 130.0), -500.0, "flow"),
-        ((300.0, 20.0), 0.0, "goal 300,20 um is in a wall"),
-        ((9000.0, 130.0), 0.0, "goal 9000,130 um is outside"),
-        ((800.0, 270.0), 0.0, "no channel leads from start to goal"),
+        ((100.0, 130.0), (1000.0, 130.0), -500.0, "flow"),
+        ((100.0, 130.0), (300.0, 20.0), 0.0, "goal 300,20 um is in a wall"),
+        ((300.0, 20.0), (100.0, 130.0), 0.0, "start 300,20 um is in a wall"),
+        ((100.0, 130.0), (9000.0, 130.0), 0.0, "goal 9000,130 um is outside"),
+        ((100.0, 130.0), (800.0, 270.0), 0.0, "no channel leads from start to goal"),
     ],
 )
-def test_a_goal_that_can_not_be_reached_has_a_reason_and_no_waypoints(any_planner, goal, flow, reason):
+def test_a_goal_that_can_not_be_reached_has_a_reason_and_no_waypoints(any_planner, start, goal, flow, reason):
     mask = channel()
     mask[18:22] = False  # two channels
-    route = any_planner.plan(field_of(mask, flow), (100.0, 130.0), goal, chip_of(mask), robot())
+    route = any_planner.plan(field_of(mask, flow), start, goal, chip_of(mask), robot())
     assert not route.reachable and reason in route.reason.replace("rrt_star found no way", "flow")
     assert len(route.waypoints_um) == len(route.arrival_s) == 0 and route.time_to_go_s is None
 
