@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -37,9 +38,6 @@ from tests.conftest import typed
 from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of
 
-CONFIG = load_config(None, ["camera.rate_hz=60"])
-CHIP = load_chip(CONFIG.chip)
-HEADER = session_header(resolve(CONFIG, CHIP), CHIP)
 TICKS = list(ticks_of(60, shape=(8, 8)))
 # What a simulator knows is in a tick only when it is new: the part after repeats less than was ever known.
 SPARSE = [
@@ -48,7 +46,14 @@ SPARSE = [
 ]
 
 
-def in_parts(path, cuts, ticks=SPARSE, header=HEADER, outcome=None):
+@cache
+def header_at_60_hz():
+    config = load_config(None, ["camera.rate_hz=60"])
+    chip = load_chip(config.chip)
+    return session_header(resolve(config, chip), chip)
+
+
+def in_parts(path, cuts, ticks=SPARSE, header=None, outcome=None):
     """Write ticks as the parts of a run that are cut before these; their files."""
     bounds = [0, *sorted(cuts), len(ticks)]
     files = []
@@ -57,7 +62,9 @@ def in_parts(path, cuts, ticks=SPARSE, header=HEADER, outcome=None):
         part = Part("one run", number, keyframe_ns=None if carried is None else carried.stamp_ns)
         following = part_path(path, number + 1).name
         last = number == len(bounds) - 1
-        with SessionWriter(part_path(path, number), replace(header, part=part), WriterOptions(block=True)) as writer:
+        with SessionWriter(
+            part_path(path, number), replace(header or header_at_60_hz(), part=part), WriterOptions(block=True)
+        ) as writer:
             for tick in [*([carried] if carried is not None else []), *ticks[begin:end]]:
                 writer.write(tick)
             writer.close(outcome or {"outcome": "reached"} if last else {"outcome": "continued", "next": following})
@@ -81,7 +88,7 @@ def news(ticks, before):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "x.mcap"
-    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
+    with SessionWriter(path, header_at_60_hz(), WriterOptions(block=True)) as writer:
         for tick in SPARSE:
             writer.write(tick)
         writer.close({"outcome": "reached"})
@@ -114,7 +121,7 @@ def test_however_a_session_is_cut_its_ticks_are_the_same_from_any_time(whole, tm
         assert list(news(mine, before)) == list(news(theirs, expected))
         assert (reader.first_ns, reader.last_ns, reader.counts) == (whole.first_ns, whole.last_ns, whole.counts)
         assert reader.outcome == whole.outcome and reader.header == replace(
-            HEADER, part=Part("one run", 1, keyframe_ns=None)
+            header_at_60_hz(), part=Part("one run", 1, keyframe_ns=None)
         )
         for field in ("frame", "true_field", "route"):
             messages = list(reader.messages(field))
@@ -162,10 +169,12 @@ def damage(run, what):
         in_parts(other, [11, 30, 40])
         part_path(other, 3).replace(third)
     elif what == "another head":
-        in_parts(other, [11, 12, 40], header=replace(HEADER, config_toml=HEADER.config_toml + "\n"))
+        in_parts(
+            other, [11, 12, 40], header=replace(header_at_60_hz(), config_toml=header_at_60_hz().config_toml + "\n")
+        )
         part_path(other, 2).replace(second)
     elif what == "no part":
-        with SessionWriter(second, HEADER, WriterOptions(overwrite=True)) as writer:
+        with SessionWriter(second, header_at_60_hz(), WriterOptions(overwrite=True)) as writer:
             writer.write(TICKS[11])
     elif what == "carries too early":
         in_parts(other, [10, 11, 12, 40])
@@ -213,7 +222,7 @@ def test_a_run_that_goes_on_or_was_killed_is_refused_as_such(run):
         SessionReader(run)
     assert [(row.name, row.outcome, row.parts) for row in ls([run.parent])] == [("x.mcap", "unfinished", 4)]
     partial_path(last).unlink()
-    with SessionWriter(last, HEADER):
+    with SessionWriter(last, header_at_60_hz()):
         with pytest.raises(SessionError, match="just now"):
             SessionReader(run)
         assert [row.outcome for row in ls([run.parent])] == ["recording"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,8 +14,7 @@ import numpy as np
 import pytest
 
 from flowrec.verbs.cli import with_default_refine
-from tests.conftest import HANG_S, run, until
-from tests.short_missions import LONG
+from tests.conftest import run
 
 
 def flowrec(*words: object) -> subprocess.CompletedProcess[str]:
@@ -93,34 +91,6 @@ def test_files_that_are_no_session_are_told_apart(session: Path, tmp_path: Path)
     one_line_error(flowrec("info", cut), 1, "cut.mcap")
     one_line_error(flowrec("record", "--out", session), 2, "exists")
     one_line_error(flowrec("record", "--out", tmp_path / "no" / "such" / "a.mcap"), 2, "no such directory")
-
-
-@pytest.mark.slow("a process that records in real time")
-def test_sigterm_zeroes_the_coils_and_finishes_the_file(tmp_path: Path) -> None:
-    out = tmp_path / "stopped.mcap"
-    words = [word for setting in LONG for word in ("--set", setting)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "flowrec", "record", "--realtime", "--out", str(out), *words],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    partial = out.with_name(out.name + ".partial")
-    until(lambda: partial.exists() and partial.stat().st_size > 2_000_000)
-    process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=HANG_S)
-    assert process.returncode == 0, said
-    assert "SIGTERM" in said
-    assert not partial.exists()
-    facts = json.loads(flowrec("info", out, "--json").stdout)["facts"]
-    assert facts["outcome"].startswith("stopped")
-    from flowrec.store import SessionReader
-
-    reader = SessionReader(out)
-    last = reader.tick_before(reader.last_ns)
-    assert last.currents is not None
-    assert last.currents.amplitude_mt == 0.0
-    assert np.all(last.currents.currents_a == 0.0)
 
 
 def test_info_tells_how_a_session_ended(session: Path) -> None:

@@ -34,7 +34,7 @@ from flowrec.store import (
 from tests.conftest import HANG_S, invoke, until
 from tests.store.made_up import ticks_of
 from tests.store.s3_server import BUCKET, KEYS, S3Server, s3_server
-from tests.store.test_run_files import HEADER, in_parts
+from tests.store.test_run_files import header_at_60_hz, in_parts
 
 SESSION = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
 TARGET = f"s3://{BUCKET}/runs"
@@ -53,7 +53,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session that is sent in several parts."""
     path = tmp_path_factory.mktemp("large") / "large.mcap"
-    with SessionWriter(path, HEADER, WriterOptions(block=True, frames="raw")) as writer:
+    with SessionWriter(path, header_at_60_hz(), WriterOptions(block=True, frames="raw")) as writer:
         for tick in ticks_of(60, shape=(540, 540)):
             writer.write(tick)
         writer.close({"outcome": "reached"})

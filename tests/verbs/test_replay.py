@@ -266,14 +266,6 @@ def test_an_existing_output_is_not_overwritten(session: Path) -> None:
         verb.replay_session(session, Change(), out=session)
 
 
-@pytest.mark.slow("verifies a session in processes, one a segment")
-def test_a_verification_in_segments_covers_every_tick(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_segments, "_TICKS", 100)
-    done = replay_segments.verify(session, jobs=2)
-    assert done.identical
-    assert done.comparison.ticks == len(SessionReader(session).stamps("applied"))
-
-
 @pytest.mark.slow("verifies a session in segments, alone and in two processes")
 def test_a_verification_in_segments_finds_what_one_pass_finds(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay_segments, "_TICKS", 40)
