@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -46,21 +45,15 @@ def mask(tmp_path: Path):  # type: ignore[no-untyped-def]
 def test_refine_without_a_method_is_pi_unet_wherever_it_stands() -> None:
     assert with_default_refine(["replay", "a.mcap", "--refine"])[-1] == "pi_unet"
     assert with_default_refine(["replay", "--refine", "a.mcap"])[2] == "pi_unet"
-    assert with_default_refine(["replay", "a.mcap", "--refine", "assimilate", "--plan", "x"]) == [
-        "replay",
-        "a.mcap",
-        "--refine",
-        "assimilate",
-        "--plan",
-        "x",
-    ]
+    named = ["replay", "a.mcap", "--refine", "assimilate", "--plan", "x"]
+    assert with_default_refine(named) == named
 
 
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [
-        (["record", "nowhere.toml"], 2, ["nowhere.toml", "no such configuration"]),
-        (["record", "--set", "contrl.method=vector"], 2, ["unknown key contrl", "control"]),
+        (["record", "nowhere.toml"], 2, ["nowhere.toml"]),
+        (["record", "--set", "contrl.method=vector"], 2, ["contrl", "control"]),
         (["record", "--set", "chip.path=nowhere.npz"], 2, ["nowhere.npz"]),
         (["record", "--goal", "0,0"], 2, ["goal"]),
         (["replay", "nowhere.mcap"], 1, ["nowhere.mcap"]),
@@ -91,12 +84,6 @@ def test_files_that_are_no_session_are_told_apart(session: Path, tmp_path: Path)
     one_line_error(flowrec("info", cut), 1, "cut.mcap")
     one_line_error(flowrec("record", "--out", session), 2, "exists")
     one_line_error(flowrec("record", "--out", tmp_path / "no" / "such" / "a.mcap"), 2, "no such directory")
-
-
-def test_info_tells_how_a_session_ended(session: Path) -> None:
-    facts = json.loads(flowrec("info", session, "--json").stdout)
-    assert facts["facts"]["outcome"] == "reached"
-    assert facts["topics"]["/camera/frame"] > 100
 
 
 HEAVY = {"torch", "rerun", "filterpy", "matplotlib", "numba", "scipy.sparse", "scipy.stats"}

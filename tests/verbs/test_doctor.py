@@ -136,8 +136,7 @@ def test_a_disk_is_judged_by_what_the_camera_delivers(
 
 @pytest.mark.slow("flies the rehearsal of a mission")
 def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path) -> None:
-    told = {one.what: one.text for one in diagnose(load_config(), folder=tmp_path)}
-    assert "mission with this configuration's methods went through" in told["kernels"]
+    assert levels(load_config(), tmp_path)["kernels"] == OK
 
 
 def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(tmp_path: Path) -> None:
@@ -182,9 +181,9 @@ def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_s
     for wrong, text in {
         "robot.radius_um=-5.0": "robot.radius_um = -5",
         "camera.bits=9": "camera.bits = 9",
-        "chip.path=nowhere.png": "nowhere.png: no such file",
+        "chip.path=nowhere.png": "nowhere.png",
         "mission.goal=[1e6, 0.0]": "goal",
-        "lab.devise=7": "unknown key lab.devise",
+        "lab.devise=7": "lab.devise",
     }.items():
         sets = [*MEASURED, *devices, wrong]
         words = ["doctor", "--json", "--folder", str(tmp_path), *(word for each in sets for word in ("--set", each))]
