@@ -173,7 +173,7 @@ def test_a_summary_counts_and_pairs_what_arrived(flown, tmp_path, capsys):
     json.dumps(figures)
     missions.show(figures)
     said = capsys.readouterr().err
-    assert "hard, vector: straight 3 down assumed: left the chip" in said and "2 commands were beyond" in said
+    assert "straight 3 down assumed" in said and "2 commands" in said
     draw_missions(tmp_path / "a.png", figures)
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 

@@ -230,7 +230,7 @@ def test_a_console_that_is_killed_or_stopped_does_not_slow_the_run_which_says_so
         served.console.write(replace(tick, stamp_ns=i))
     if blow == signal.SIGKILL:
         until(lambda: served.told)
-        assert served.told == ["the console ended (it was killed); the run goes on without"]
+        assert len(served.told) == 1 and "killed" in served.told[0]
     served.console.close(timeout_s=0.3)
     assert served.console.dropped > 1000
     until(lambda: not psutil.pid_exists(pid))

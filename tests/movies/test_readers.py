@@ -215,7 +215,7 @@ def test_sizes_are_refused_from_the_header_before_anything_is_decoded(tmp_path, 
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     monkeypatch.setattr(tifffile.TiffPage, "asarray", lambda *_: pytest.fail("decoded"))
     for name in ("bomb", "bomb.tif", "tiny"):
-        with pytest.raises(MovieError, match=r"from 8 to 16384 on each side|more than 150 million pixels"):
+        with pytest.raises(MovieError, match=r"8 to 16384|150 million"):
             open_movie(tmp_path / name)
 
 
@@ -297,7 +297,7 @@ def test_the_early_end_of_a_movie_is_what_its_rig_noticed_while_it_played(tmp_pa
 
 def test_samples_of_more_bits_than_an_image_can_have_are_refused(tmp_path):
     path = makers.folder(tmp_path / "pngs", pictures())
-    with open_movie(path) as movie, pytest.raises(MovieError, match=r"have 32 bits.*convert it, for example with ffm"):
+    with open_movie(path) as movie, pytest.raises(MovieError, match=r"32 bits.*ffm"):
         movie._depth(32, 32)
 
 
@@ -341,7 +341,7 @@ def test_a_series_of_several_ome_files_is_one_movie(tmp_path):
     assert facts.frames == len(frames) == 12 and "DeltaT" in facts.times
     np.testing.assert_array_equal([frame.image for frame in frames], [image.astype(np.uint8) for image in images])
     (tmp_path / "part2.ome.tif").unlink()
-    with pytest.raises(MovieError, match=r"breaks off|no TIFF that can be read"):
+    with pytest.raises(MovieError, match=str(tmp_path)):
         read(tmp_path / "part0.ome.tif")
 
 

@@ -38,7 +38,7 @@ def test_a_tiff_of_fewer_images_than_the_index_names_is_not_left(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flowrec.exports.tiff.image_stamps", lambda opened: [*image_stamps(opened), 10**12])
-    with pytest.raises(SessionError, match=rf"its index names {p.COUNT + 1} images, {p.COUNT} are there"):
+    with pytest.raises(SessionError, match=rf"{p.COUNT + 1} images, {p.COUNT} "):
         flowrec.export(session, tmp_path / "a.ome.tif", file_format="tiff")
     assert not list(tmp_path.glob("a*"))
 

@@ -267,7 +267,7 @@ def test_a_world_that_can_not_be_is_refused_in_one_line():
         with pytest.raises((ChipError, UsageError), match=named):
             rig_with(**wrong)
     other = FlowSolver(1).solve(load_chip(ChipSettings("bifurcation")))
-    with pytest.raises(RigError, match="solve it on this chip"):
+    with pytest.raises(RigError, match="chip"):
         next(iter(rig_with(flow=other).inputs()))
 
 

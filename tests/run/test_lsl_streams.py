@@ -187,7 +187,7 @@ def test_two_outlets_of_one_name_are_refused_with_both_named_and_a_query_tells_t
 
 def test_an_outlet_of_texts_or_of_nobody_is_refused_in_one_line(name: str) -> None:
     with (
-        pytest.raises(RigError, match=r"^streams\.pump: no outlet of the Lab Streaming Layer with name .* \(wait_s\)$"),
+        pytest.raises(RigError, match=r"^streams\.pump: .* \(wait_s\)$"),
         Listening([], pump=StreamSettings(outlet=name, wait_s=0.1, on_silence="stop")),
     ):
         pass

@@ -292,12 +292,12 @@ def test_a_sender_that_is_not_there_is_refused_unless_it_is_only_noted() -> None
     with pytest.raises(RigError, match=r"streams\.pump: .*0\.1 s"):
         reader_of(Absent(), wait_s=0.1, on_silence="hold")
     reader, told = reader_of(Absent(), wait_s=0.1)
-    assert reader.state.gone and told == ["streams.pump: no outlet; the run begins without it"]
+    assert reader.state.gone and len(told) == 1 and told[0].startswith("streams.pump: ")
 
 
 def test_channels_are_named_by_the_settings_or_the_sender_or_their_number() -> None:
     assert named_channels(StreamSettings(), ["p", "q"], 2) == ("p", "q")
     assert named_channels(StreamSettings(channels=("x", "y")), ["p", "q"], 2) == ("x", "y")
     assert named_channels(StreamSettings(), ["p", "p"], 2) == ("1", "2")
-    with pytest.raises(RigError, match="has 3 channels"):
+    with pytest.raises(RigError, match="3 channels"):
         named_channels(StreamSettings(channels=("x", "y")), [], 3)

@@ -1,7 +1,7 @@
 """Ticks of a made-up run: nothing in them means anything, everything in them is recorded."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -102,3 +102,9 @@ def ticks_of(count: int, *, shape: tuple[int, int] = (48, 64), seed: int = 0, im
             news["operator"] = OperatorEvent(now, "note", "a: b")
         tick = replace(tick, stamp_ns=now, **news)
         yield tick
+
+
+def same(one, other, but=()):
+    """Whether two ticks hold the same, but for some of their fields."""
+    pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(Tick) if each.name not in but)
+    return all(mine == theirs or (None not in (mine, theirs) and mine.same_as(theirs)) for mine, theirs in pairs)

@@ -3,7 +3,7 @@
 import signal
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,7 +20,7 @@ from flowrec.store.session_file import SessionFile
 from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.compare import compare
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, same, ticks_of
 from tests.store.test_damage import KILLED, names_in
 
 TICKS = list(ticks_of(40, shape=(8, 8)))
@@ -68,11 +68,7 @@ def cut(path, length, to):
 
 
 def same_ticks(one, other):
-    return len(one) == len(other) and all(
-        mine is theirs is None or mine == theirs or mine.same_as(theirs)
-        for a, b in zip(one, other, strict=True)
-        for mine, theirs in ((getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
-    )
+    return len(one) == len(other) and all(map(same, one, other))
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,10 @@ from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.run_files import snapshot_path
 from flowrec.store.session_file import SessionFile, Snapshot
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import slow_disk
-from tests.store.test_split import messages_in, same
+from tests.store.test_split import messages_in
 
 QUIET = [replace(tick, operator=None) for tick in ticks_of(600)]  # 10 s
 ABOUT = Snapshot(before_s=2.0, after_s=1.0)

@@ -36,7 +36,7 @@ from flowrec.verbs.ls import ls
 from flowrec.verbs.record import record
 from tests.conftest import typed
 from tests.short_missions import SMALL
-from tests.store.made_up import ticks_of
+from tests.store.made_up import same, ticks_of
 
 TICKS = list(ticks_of(60, shape=(8, 8)))
 # What a simulator knows is in a tick only when it is new: the part after repeats less than was ever known.
@@ -70,13 +70,6 @@ def in_parts(path, cuts, ticks=SPARSE, header=None, outcome=None):
             writer.close(outcome or {"outcome": "reached"} if last else {"outcome": "continued", "next": following})
         files.append(part_path(path, number))
     return files
-
-
-def same(one, other):
-    return one.stamp_ns == other.stamp_ns and all(
-        mine is theirs or (mine is not None and mine.same_as(theirs))
-        for mine, theirs in ((getattr(one, field), getattr(other, field)) for field in BY_FIELD)
-    )
 
 
 def news(ticks, before):

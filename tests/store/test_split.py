@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from flowrec.core import NS_PER_S, SessionError, Tick, seconds
+from flowrec.core import NS_PER_S, SessionError, seconds
 from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, part_path, recover
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
@@ -26,7 +25,7 @@ from flowrec.store.run_files import run_files
 from flowrec.store.scan import scan
 from flowrec.store.segments import RecordingPlan
 from flowrec.store.session_file import Split
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, same, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import GatedDisk, slow_disk
 
@@ -71,12 +70,6 @@ def news_of(paths):
         # What is told twice was new at or before that tick, all of it logged there.
         assert carried is None or min(log for _, log, _, _ in messages) == int(carried)
     return found
-
-
-def same(first: Tick, second: Tick):
-    names = [field.name for field in fields(Tick) if field.name != "stamp_ns"]
-    pairs = [(getattr(first, name), getattr(second, name)) for name in names]
-    return all(mine is theirs or (mine is not None and mine.same_as(theirs)) for mine, theirs in pairs)
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import Snapshot, Split
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from tests.conftest import HANG_S, until
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of
 
 TICKS = list(ticks_of(150))
 
@@ -41,14 +41,6 @@ def record(path, ticks=TICKS, outcome=None, **options):
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     return record(tmp_path_factory.mktemp("sessions") / "session.mcap")
-
-
-def same(first: Tick, second: Tick, *, but: tuple[str, ...] = ()) -> bool:
-    for field in fields(Tick):
-        mine, theirs = getattr(first, field.name), getattr(second, field.name)
-        if field.name not in but and mine != theirs and not mine.same_as(theirs):
-            return False
-    return True
 
 
 def news(ticks, before=None):

@@ -164,9 +164,9 @@ def test_files_and_folders_are_listed_together_chosen_by_their_facts_and_sorted(
 @pytest.mark.parametrize(
     ("chosen", "named"),
     [
-        ({"where": "refined_error < 0.05"}, "refined_flow_error"),
+        ({"where": "refined_error < 0.05"}, "did you mean refined_flow_error"),
         ({"where": "exists(from read_text('a.mcap'))"}, ""),  # the others: tests/archive/catalog/test_catalog.py
-        ({"sort": "outcom"}, "outcome"),
+        ({"sort": "outcom"}, "did you mean outcome"),
     ],
 )
 def test_an_expression_that_is_wrong_or_does_more_than_choose_is_refused_in_one_line(

@@ -424,9 +424,9 @@ def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(
     assert typed("find", "--limit", 5).stdout.count(".mcap") == 5
     assert len(json.loads(typed("find", "--json").stdout)["sessions"]) == 7
     for wrong, named in (
-        ({"where": "outcom = 'reached'"}, "outcome"),
-        ({"where": "sweep.refin = 'fvm'"}, "sweep.refine"),
-        ({"sort": "-outcom"}, "outcome"),
+        ({"where": "outcom = 'reached'"}, "did you mean outcome"),
+        ({"where": "sweep.refin = 'fvm'"}, "did you mean sweep.refine"),
+        ({"sort": "-outcom"}, "did you mean outcome"),
         ({"catalog": standing / "none.parquet"}, "none.parquet"),
     ):
         with pytest.raises(UsageError, match=rf"\b{named}\b"):

@@ -57,7 +57,7 @@ def test_a_wall_clock_that_is_set_is_told_at_once_and_with_its_size():
     assert 5 <= len(said) <= 7
     outcome = watch.outcome()
     assert int(outcome["wall_ns"]) - int(outcome["monotonic_ns"]) == clocks.wall_off_ns
-    assert "wall clock set 2 times, by -3598.000 s in all" in outcome["clocks"]
+    assert "2 times, by -3598.000 s" in outcome["clocks"]
 
 
 @pytest.mark.parametrize(("set_ms", "told"), [(50, 1), (-50, 1), (5, 0)])

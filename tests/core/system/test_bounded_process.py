@@ -32,18 +32,18 @@ def test_an_error_for_people_comes_back_as_it_is_and_any_other_names_the_file():
 def test_a_file_that_asks_for_more_memory_than_it_may_is_refused():
     with (
         BoundedProcess("a.bin", 10.0, memory_bytes=1 << 28) as process,
-        pytest.raises(UsageError, match=r"^a\.bin: needs more than 0\.27 GB of memory"),
+        pytest.raises(UsageError, match=r"^a\.bin: .*0\.27 GB"),
     ):
         process.call(bytearray, 1 << 30)
 
 
 def test_a_file_that_takes_more_time_than_it_may_is_refused():
-    with BoundedProcess("a.bin", 0.1) as process, pytest.raises(UsageError, match=r"^a\.bin: takes more than 0\.1 s"):
+    with BoundedProcess("a.bin", 0.1) as process, pytest.raises(UsageError, match=r"^a\.bin: .*0\.1 s"):
         process.call(sum, range(10**12))
 
 
 def test_work_that_waits_for_a_disk_is_ended_by_the_clock():
-    late = pytest.raises(UsageError, match=r"^a\.bin: takes more than 0\.5 s")
+    late = pytest.raises(UsageError, match=r"^a\.bin: .*0\.5 s")
     with BoundedProcess("a.bin", 0.5, by_clock=True) as process, late:
         process.call(time.sleep, 60.0)
     assert process._child.process.poll() is not None
@@ -53,7 +53,7 @@ def test_work_that_waits_for_a_disk_is_ended_by_the_clock():
 def test_a_reader_that_crashes_takes_nobody_with_it():
     with BoundedProcess("a.bin", 10.0, by_clock=True) as process:
         for work in (os.abort, os.getpid):  # the second one does not wait for a process that has ended
-            with pytest.raises(UsageError, match=r"its reader has ended \(SIGABRT"):
+            with pytest.raises(UsageError, match="SIGABRT"):
                 process.call(work)
 
 

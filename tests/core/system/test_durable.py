@@ -76,7 +76,7 @@ def test_a_note_on_a_full_disk_is_an_error_and_the_others_stay_whole(tmp_path: P
         with disk_of(len(before) + room), pytest.raises(SessionError, match=r"\.jsonl"):
             append_note(session, "key", "the bubble entered at 12:30", [], "Zoë")
         assert notes_file(session).read_bytes() == before
-    with disk_of(5), pytest.raises(SessionError, match="can not be written"):
+    with disk_of(5), pytest.raises(SessionError, match=r"b\.mcap"):
         append_note(tmp_path / "b.mcap", "key", "first", [], "Zoë")
     append_note(session, "key", "second", [], "Zoë")
     assert [note.text for note in read_notes(session, "key")] == ["first", "second"]
@@ -94,7 +94,7 @@ def test_a_line_that_a_power_cut_has_torn_is_not_continued(tmp_path: Path) -> No
 def test_a_file_that_can_not_be_replaced_is_as_it_was(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_bytes(b"old")
-    refused = pytest.raises(SessionError, match=r"a\.json: can not be written")
+    refused = pytest.raises(SessionError, match=r"a\.json: ")
     with refused, disk_of(1000), Output(path, JSON, overwrite=True).new_file() as part:
         part.write_bytes(bytes(2000))
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
@@ -104,7 +104,7 @@ def test_what_was_put_in_the_place_of_an_output_while_it_was_made_stays(tmp_path
     path = tmp_path / "a.json"
     path.write_bytes(b"ours")
     ours = "79ccc9d00c1ae44ab5e56dc39aa7b42be9d71b2b69d8c1e1d5a39c12f5b79c12"
-    with pytest.raises(SessionError, match="was changed since flowrec wrote it"):
+    with pytest.raises(SessionError, match=r"a\.json"):
         Output(path, JSON, replaces=ours).check()
     import hashlib
 
@@ -113,7 +113,7 @@ def test_what_was_put_in_the_place_of_an_output_while_it_was_made_stays(tmp_path
         part.write_bytes(b"new")
     assert path.read_bytes() == b"new"
     path.write_bytes(b"ours")
-    with pytest.raises(SessionError, match="was changed since"), output.new_file():
+    with pytest.raises(SessionError, match=r"a\.json"), output.new_file():
         path.write_bytes(b"of a person")
     assert path.read_bytes() == b"of a person" and list(tmp_path.iterdir()) == [path]
 

@@ -181,5 +181,5 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with pytest.raises(UsageError, match=r"needs pyxdf: pip install 'flowrec\[movies\]'"):
+    with pytest.raises(UsageError, match=r"pip install 'flowrec\[movies\]'"):
         read_table(unlike(tmp_path / "run.xdf", b"XDF:"))

@@ -184,7 +184,7 @@ def test_a_coil_that_has_half_of_its_current_is_noticed_by_its_sensor_and_ends_i
         np.testing.assert_allclose(measured.currents_a, measured.put_out_a, atol=atol_a)
         fault.touch()
         begin_ns = time.monotonic_ns()
-        with pytest.raises(RigError, match=rf"{named}: coil x has .* A where .* A are put out, for \d+ ms"):
+        with pytest.raises(RigError, match=rf"{named}: coil x .* A .* A .*\d+ ms"):
             commanded(drive)
         assert time.monotonic_ns() - begin_ns < 1e9
         off_ns = on.off_ns(begin_ns)
@@ -315,7 +315,7 @@ def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
         ):
             pytest.fail("it opened")
         assert words in str(refused.value) and "\n" not in str(refused.value)
-    with driven(serial), pytest.raises(RigError, match="another program uses this port"), driven(serial):
+    with driven(serial), pytest.raises(RigError, match="another program"), driven(serial):
         pass
     for one, begin in begins.items():
         assert not one.energised(begin)

@@ -188,5 +188,5 @@ def test_the_guardian_watches_until_the_field_is_down_and_no_longer() -> None:
 def test_an_amplifier_whose_timer_is_shorter_than_two_beats_is_refused() -> None:
     told = Told()
     told.timer_s = 1.9 * BEAT_S
-    with pytest.raises(UsageError, match=r"beats every 0\.02 s; at least 0\.04 s are needed"), driven(told, Clock()):
+    with pytest.raises(UsageError, match=r"0\.02 s; .*0\.04 s"), driven(told, Clock()):
         pytest.fail("it opened")

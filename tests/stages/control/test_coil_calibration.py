@@ -93,9 +93,9 @@ def test_a_row_that_nothing_confirms_is_named():
     fit = fit_coils(measured(1, currents))
     assert fit.unchecked == [5] and np.isnan(fit.left_out_mt[5]).all()
     said = advice(fit)
-    assert any("line 7: no other row excites" in sentence for sentence in said)
-    assert any("coil z was driven one way only" in sentence for sentence in said)
-    assert any("6 rows leave 2" in sentence for sentence in said)
+    assert any(sentence.startswith("line 7: ") for sentence in said)
+    assert any("coil z" in sentence for sentence in said)
+    assert any("6 rows" in sentence and " 2 " in sentence for sentence in said)
 
 
 @pytest.mark.parametrize(

@@ -228,7 +228,7 @@ def test_a_field_of_six_coils_turns_as_that_of_three_and_what_is_missing_of_it_i
 def test_a_mission_with_six_coils_says_once_what_the_coils_could_not_do():
     assert "weaker" not in " ".join(verdict_lines({"outcome": "reached"}))
     lines = verdict_lines({"outcome": "reached", "unmet_mt": 0.8})
-    assert lines[1] == "The field was 0.8 mT weaker than asked for: a limit of the coils"
+    assert "0.8 mT" in lines[1]
 
 
 @pytest.mark.parametrize(

@@ -205,7 +205,7 @@ def test_without_changes_of_the_command_nothing_is_claimed() -> None:
     nothing = Log(log.times_s, np.zeros((2, 2)))
     with pytest.raises(UsageError, match="no turns"):
         fit(*track(log, 12, 20.0), nothing)
-    with pytest.raises(UsageError, match="frames with the robot"):
+    with pytest.raises(UsageError, match="frames"):
         fit(np.arange(5.0), np.zeros((5, 2)), log)
 
 

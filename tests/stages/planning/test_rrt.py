@@ -23,7 +23,7 @@ def test_trees_find_a_way_the_same_one_every_time_and_the_star_a_faster_one_but_
     assert first.reachable and star.reachable
     assert best.arrival_s[-1] < star.arrival_s[-1] < first.arrival_s[-1]
     few = Planner(method="rrt", rrt=RrtSettings(iterations=5)).plan(field, EAST, WEST, chip, robot(200.0))
-    assert not few.reachable and "rrt found no way in 5 iterations" in few.reason
+    assert not few.reachable and "5 iterations" in few.reason
 
 
 def test_without_ompl_the_trees_say_how_to_get_it(monkeypatch):
