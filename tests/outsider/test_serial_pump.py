@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import select
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -18,39 +15,20 @@ from flowrec.core import SAMPLES, SILENT, STREAMS, UsageError, outside
 from flowrec.run import RunControl, StreamInputs
 from flowrec.stages import STREAM_KINDS, load_config
 from tests.real_time import Clock, ticks
-
-pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")
-tty = pytest.importorskip("tty", reason="no pseudo terminals on this system")
+from tests.twins.terminal import TerminalTwin
 
 
-class Twin:
-    """The pump: sends its flow rate every 10 ms, its clock an hour behind ours."""
+class Twin(TerminalTwin):
+    """The pump: sends its flow rate all the time, its clock an hour behind ours."""
 
-    def __init__(self) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self.set_to: list[str] = []
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
+    flow = 0.0
 
-    def _run(self) -> None:
-        flow, taken = 0.0, b""
-        while not self._closing.wait(0.01):
-            if select.select([self._master], [], [], 0.0)[0]:
-                taken += os.read(self._master, 100)
-                *lines, taken = taken.split(b"\n")
-                for line in lines:
-                    self.set_to.append(line.decode())
-                    flow = float(line.split()[1])
-            os.write(self._master, b"%d %.2f\n" % (1000.0 * time.monotonic() - 3.6e6, flow))
+    def answer(self, line: str) -> None:
+        self.flow = float(line.split()[1])
 
-    def unplug(self) -> None:
-        self._closing.set()
-        self._thread.join()
-        os.close(self._master)
-        os.close(self._slave)
+    def idle(self) -> None:
+        self.send(f"{1000.0 * time.monotonic() - 3.6e6:.0f} {self.flow:.2f}\n")
+        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -87,7 +65,7 @@ def test_the_pump_is_set_its_flow_is_an_input_on_our_clock_and_it_is_silent_when
             if states is not None and states.state[0] == SILENT:  # type: ignore[attr-defined]
                 break
             assert time.monotonic() < end_s, told
-    assert twin.set_to == ["F 12.000"]
+    assert twin.lines == ["F 12.000"]
     values = np.concatenate([each.value[each.channel == 0] for each in found])
     stamps = np.concatenate([each.sample_ns[each.channel == 0] for each in found])
     ticked = np.concatenate([np.full((each.channel == 0).sum(), each.stamp_ns) for each in found])

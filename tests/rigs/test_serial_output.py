@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import select
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -20,9 +17,7 @@ from flowrec.rigs.streams.serial_output import SerialOutput, SerialOutputSetting
 from flowrec.run import RunControl, StreamInputs, obey
 from flowrec.stages import load_config
 from tests.real_time import Clock, ticks
-
-pty = pytest.importorskip("pty", reason="no pseudo terminals on this system")
-tty = pytest.importorskip("tty", reason="no pseudo terminals on this system")
+from tests.twins.terminal import TerminalTwin
 
 MOST_TICKS = 1500  # 30 s
 GENERATOR = {
@@ -35,39 +30,19 @@ GENERATOR = {
 }
 
 
-class Device:
+class Device(TerminalTwin):
     """A function generator: keeps what it is set to, and answers when it is asked; its amplitude stops at 3 V."""
 
     def __init__(self) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self.lines: list[str] = []
         self.state = {"VOLT": 0.0, "FREQ": 0.0}
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
+        super().__init__()
 
-    def _run(self) -> None:
-        taken = b""
-        while not self._closing.is_set():
-            if not select.select([self._master], [], [], 0.01)[0]:
-                continue
-            taken += os.read(self._master, 100)
-            *lines, taken = taken.split(b"\n")
-            for line in map(bytes.decode, lines):
-                self.lines.append(line)
-                if line.endswith("?"):
-                    os.write(self._master, b"%s %.3e V\r\n" % (line[:-1].encode(), self.state[line[:-1]]))
-                else:
-                    name, value = line.split()
-                    self.state[name] = min(float(value), 3.0 if name == "VOLT" else 1e9)
-
-    def unplug(self) -> None:
-        self._closing.set()
-        self._thread.join()
-        os.close(self._master)
-        os.close(self._slave)
+    def answer(self, line: str) -> None:
+        if line.endswith("?"):
+            self.send(f"{line[:-1]} {self.state[line[:-1]]:.3e} V\r\n")
+        else:
+            name, value = line.split()
+            self.state[name] = min(float(value), 3.0 if name == "VOLT" else 1e9)
 
 
 def streams_of(control: RunControl, told: list[str], **device: Any) -> tuple[StreamInputs, Clock, RunLog]:

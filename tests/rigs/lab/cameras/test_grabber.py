@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import CameraLosses, RigError
+from flowrec.core import RigError
 from flowrec.rigs import Wanted
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from tests.conftest import HANG_S
 from tests.rigs.lab.cameras.scripted import GONE, INFO, WANTED, Scripted, Step, block
+from tests.rigs.lab.cameras.watching import adds_up
 
 
 @contextmanager
@@ -37,12 +38,6 @@ def following(grabber: Grabber) -> Captured:
     return frame
 
 
-def whole(losses: CameraLosses | None) -> bool:
-    assert losses is not None
-    lost = losses.link + losses.incomplete + losses.driver + losses.backlog
-    return losses.frames + lost == losses.ids
-
-
 def test_frames_and_losses_by_cause_add_up_to_the_ids() -> None:
     steps: list[Step] = [block(n) for n in (65_530, 65_531, 65_533, 65_534)]
     steps += [block(65_535, whole=False), block(1), block(5), block(3, whole=False), block(6)]
@@ -52,7 +47,7 @@ def test_frames_and_losses_by_cause_add_up_to_the_ids() -> None:
     last = frames[-1].losses
     assert [frame.index for frame in frames] == [0, 1, 3, 4, 6, 10, 11]
     assert (last.ids, last.frames, last.link, last.incomplete) == (12, 7, 3, 2)
-    assert all(whole(frame.losses) for frame in frames)
+    assert all(adds_up(frame.losses) for frame in frames)
     assert [int(frame.image[0, 0]) for frame in frames] == [n % 251 for n in (65_530, 65_531, 65_533, 65_534, 1, 5, 6)]
 
 
@@ -70,7 +65,7 @@ def test_an_incomplete_image_is_never_handed_on_and_is_counted() -> None:
     with grabbing(camera) as grabber:
         frames = captured(grabber, camera)
     assert [frame.index for frame in frames] == [1, 3]
-    assert frames[-1].losses.incomplete == 2 and whole(frames[-1].losses)
+    assert frames[-1].losses.incomplete == 2 and adds_up(frames[-1].losses)
 
 
 def test_what_a_full_queue_drops_is_the_oldest_and_counted_as_backlog() -> None:
@@ -78,7 +73,7 @@ def test_what_a_full_queue_drops_is_the_oldest_and_counted_as_backlog() -> None:
     with grabbing(camera, length=4) as grabber:
         frames = captured(grabber, camera)
     assert [frame.index for frame in frames] == [16, 17, 18, 19]
-    assert frames[-1].losses.backlog == 16 and all(whole(frame.losses) for frame in frames)
+    assert frames[-1].losses.backlog == 16 and all(adds_up(frame.losses) for frame in frames)
 
 
 def test_what_the_driver_threw_away_is_told_from_what_the_link_lost() -> None:
@@ -87,7 +82,7 @@ def test_what_the_driver_threw_away_is_told_from_what_the_link_lost() -> None:
     camera.steps.extend([block(1), lambda: setattr(camera, "lost", 3), *map(block, (2, 3, 7, 8, 10))])
     with grabbing(camera) as grabber:
         last = captured(grabber, camera)[-1].losses
-    assert (last.driver, last.link) == (3, 1) and whole(last)
+    assert (last.driver, last.link) == (3, 1) and adds_up(last)
 
 
 def test_a_camera_without_ids_is_counted_by_its_driver() -> None:
@@ -96,7 +91,7 @@ def test_a_camera_without_ids_is_counted_by_its_driver() -> None:
     with grabbing(camera) as grabber:
         frames = captured(grabber, camera)
     assert [frame.index for frame in frames] == [0, 3, 4]
-    assert frames[-1].losses.driver == 2 and whole(frames[-1].losses)
+    assert frames[-1].losses.driver == 2 and adds_up(frames[-1].losses)
 
 
 @pytest.mark.parametrize("end", [[GONE], []], ids=["the driver says so", "silence"])
@@ -112,7 +107,7 @@ def test_a_camera_that_is_gone_is_opened_again_until_it_is_back(end: list[Step])
         third, fourth = following(grabber), following(grabber)
         assert grabber.absent == ""
     assert (third.index, fourth.index) == (2, 4)
-    assert fourth.losses.reconnections == 1 and fourth.losses.link == 1 and whole(fourth.losses)
+    assert fourth.losses.reconnections == 1 and fourth.losses.link == 1 and adds_up(fourth.losses)
     assert [camera.opened for camera in away] == [1, 1, 1]
 
 
@@ -142,7 +137,7 @@ def test_triggers_that_no_block_has_answered_are_counted_by_the_clock_of_the_cam
     camera = Scripted.delivering(arrived, info=replace(INFO, ticks_per_s=1e9))
     with grabbing(camera, wanted=replace(WANTED, trigger="Line1")) as grabber:
         last = captured(grabber, camera)[-1].losses
-    assert (last.triggers, last.link) == (3, 1) and whole(last)
+    assert (last.triggers, last.link) == (3, 1) and adds_up(last)
 
 
 def test_a_software_trigger_is_sent_at_the_rate_and_a_missed_one_is_counted() -> None:
@@ -160,7 +155,7 @@ def test_a_software_trigger_is_sent_at_the_rate_and_a_missed_one_is_counted() ->
     with grabbing(camera, wanted=replace(WANTED, trigger="software")) as grabber:
         for _ in range(5):
             following(grabber)
-        assert grabber.losses is not None and grabber.losses.triggers == 1 and whole(grabber.losses)
+        assert grabber.losses is not None and grabber.losses.triggers == 1 and adds_up(grabber.losses)
 
 
 @pytest.mark.parametrize("ticks", [None, 0], ids=["none", "always 0"])
