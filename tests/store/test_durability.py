@@ -188,7 +188,7 @@ def test_a_run_that_waits_for_its_disk_is_never_more_than_flush_s_ahead_of_it(tm
     monkeypatch.setattr(McapWriter, "_put", slowly)
     ahead_s = []
     with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True, flush_s=0.5)) as writer:
-        for tick in ticks_of(150, shape=(8, 8)):
+        for tick in ticks_of(90, shape=(8, 8)):
             writer.write(tick)
             # As a kill would find it now.
             with contextlib.closing(McapReader(writer.partial_path)) as source:

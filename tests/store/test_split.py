@@ -285,12 +285,12 @@ def copy_as_it_is(folder, to):
 
 
 def test_however_slow_the_disk_ends_a_part_a_kill_leaves_no_hole_before_the_next(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "fsync", lambda number: time.sleep(0.15))
+    monkeypatch.setattr(os, "fsync", lambda number: time.sleep(0.08))  # longer than a part
     path, moments = tmp_path / "x.mcap", []
     with SessionWriter(path, HEADER, WriterOptions(files=Split(seconds=0.3), flush_s=0.1)) as writer:
         for number, tick in enumerate(TICKS):
             writer.write(tick)
-            time.sleep(0.004)
+            time.sleep(0.002)
             if number % 20 == 19:  # as a kill would find it
                 moments.append(tmp_path / f"{number}")
                 copy_as_it_is(tmp_path, moments[-1])
