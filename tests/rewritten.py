@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
@@ -121,11 +120,6 @@ def edit_of_head(name: str, **values: str) -> EditHead:
     return edit
 
 
-def array_of(wire: Any) -> np.ndarray:
-    """A flowrec.Array as a numpy array that can be changed."""
-    return np.frombuffer(wire.data, np.dtype(wire.dtype)).reshape(tuple(wire.shape)).copy()
-
-
 def leaves_of(wire: Any, path: str = "") -> list[tuple[str, Callable[[], None]]]:
     """Each single value in a message, by its name, with something that changes it."""
     found: list[tuple[str, Callable[[], None]]] = []
@@ -143,10 +137,6 @@ def leaves_of(wire: Any, path: str = "") -> list[tuple[str, Callable[[], None]]]
                 (name, lambda field=field: setattr(wire, field.name, _other(getattr(wire, field.name), field)))
             )
     return found
-
-
-def _change(wire: Any, field: Any) -> None:
-    setattr(wire, field.name, _other(getattr(wire, field.name), field))
 
 
 def _change_first(values: Any, field: Any) -> None:
