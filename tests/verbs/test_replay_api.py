@@ -103,7 +103,11 @@ def test_text_in_the_comparison_is_escaped_in_html() -> None:
 
 def test_a_change_is_given_once_and_as_a_list_or_a_dictionary(tmp_path: Path) -> None:
     twice = {"change": flowrec.Change(plan="astar"), "plan": "astar"}
-    for wrong, named in ((twice, ""), ({"sets": "a=1"}, "a=1"), ({"sets": {"plan.clearence_um": 1}}, "clearence_um")):
+    for wrong, named in (
+        (twice, "change"),
+        ({"sets": "a=1"}, "a=1"),
+        ({"sets": {"plan.clearence_um": 1}}, "clearence_um"),
+    ):
         with pytest.raises(UsageError, match=named):
             flowrec.replay(GOLDEN, **wrong)
     assert not list(tmp_path.iterdir())
