@@ -7,11 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson
 from scipy.optimize import brentq
 
-from flowrec.core import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, Floats
 from flowrec.physics import (
     CarreauYasuda,
     Chip,
@@ -25,8 +24,6 @@ from flowrec.physics import (
     from_distance,
     generalised_equations,
 )
-
-Floats = NDArray[np.float64]
 
 LAWS: dict[str, ViscosityLaw] = {
     "power law 0.5": PowerLaw(0.5, plateau_1_s=1e-3),

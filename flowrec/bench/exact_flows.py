@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, Floats
 from flowrec.physics import Chip, FlowSolver, Opening, Walls, from_distance, newton_equations, sample
 
 _UM_PER_PX, _SPEED_UM_S, _MARGIN_PX = 10.0, 100.0, 2
@@ -66,7 +66,7 @@ def bend_case(k: int) -> dict[str, Any]:
     """
     inner, outer = 12.3, 20.3
 
-    def distance(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distance(x: Floats, y: Floats) -> Floats:
         radius = np.hypot(x + 0.5, y + 0.5)
         return np.asarray(np.minimum(radius - inner, outer - radius))
 
@@ -91,12 +91,12 @@ def bend_case(k: int) -> dict[str, Any]:
     return {"width_px": outer - inner, "k": k, "resistance_error_percent": 100.0 * (slope / exact - 1.0)}
 
 
-def _parabola(across: NDArray[np.float64]) -> NDArray[np.float64]:
+def _parabola(across: Floats) -> Floats:
     """Plane Poiseuille flow at fractions of the width from one wall."""
     return 6.0 * _SPEED_UM_S * across * (1.0 - across)
 
 
-def _relative_percent(found: NDArray[np.floating], exact: NDArray[np.float64]) -> float:
+def _relative_percent(found: NDArray[np.floating], exact: Floats) -> float:
     return 100.0 * float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
 
 

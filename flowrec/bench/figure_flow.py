@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from flowrec.bench.figures import INK, QUIET, SOLID, new_figure, style
-from flowrec.core import MM_PER_UM
+from flowrec.core import MM_PER_UM, Bools, Ints
 from flowrec.exports import style as report_style
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class FlowPanels:
     """One case. Velocities are (h, w, 2) in um/s, drawn in mm/s; y points down."""
 
     name: str
-    mask: NDArray[np.bool_]  # (h, w)
+    mask: Bools  # (h, w)
     um_per_px: float
     truth: NDArray[np.floating]
     fields: dict[str, NDArray[np.floating]]  # by method
@@ -122,13 +122,13 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
     ax.set_xlim(-0.5, len(methods) - 0.2)
 
 
-def _show(ax: Axes, image: NDArray[np.floating], mask: NDArray[np.bool_], colours: str, top: float) -> Any:
+def _show(ax: Axes, image: NDArray[np.floating], mask: Bools, colours: str, top: float) -> Any:
     """An image (h, w) of the fluid; solid is grey."""
     ax.set_facecolor(SOLID)
     return ax.imshow(np.ma.masked_array(image, ~mask), cmap=colours, vmin=0.0, vmax=top, interpolation="nearest")
 
 
-def _arrows(ax: Axes, velocity: NDArray[np.floating], places: NDArray[np.intp], top: float) -> None:
+def _arrows(ax: Axes, velocity: NDArray[np.floating], places: Ints, top: float) -> None:
     """Arrows at places (n, 2), row and column, where the flow is not slow; one of speed `top`, mm/s, fills a block."""
     rows, columns = places[_length(velocity[places[:, 0], places[:, 1]]) > SHORTEST * top].T
     shape: dict[str, Any] = {"width": 0.009, "headwidth": 3.6, "headlength": 4.0, "headaxislength": 3.6, "pivot": "mid"}
@@ -136,7 +136,7 @@ def _arrows(ax: Axes, velocity: NDArray[np.floating], places: NDArray[np.intp], 
     ax.quiver(columns, rows, *(MM_PER_UM * velocity[rows, columns]).T, color="white", **scale, **shape)
 
 
-def _arrow_places(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _arrow_places(mask: Bools) -> Ints:
     """(n, 2) row and column of the pixel farthest from the walls in each block."""
     depth = distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]
     places = []

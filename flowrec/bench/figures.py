@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import MM_PER_UM
+from flowrec.core import MM_PER_UM, Floats
 from flowrec.exports import style as report_style
 
 if TYPE_CHECKING:
@@ -106,9 +105,9 @@ def _bars(ax: Axes, values: dict[str, list[float | None]], scale: float) -> None
 
 def draw_observer(
     path: Path,
-    time_s: NDArray[np.float64],
-    truth: NDArray[np.float64],
-    estimates: dict[str, NDArray[np.float64]],
+    time_s: Floats,
+    truth: Floats,
+    estimates: dict[str, Floats],
     rmse: dict[str, dict[float, float]],
 ) -> None:
     """Estimated and true flow (n, 2) in um/s at `time_s` (n,), the errors, and RMSE by observer and noise in um."""
@@ -140,9 +139,7 @@ def draw_observer(
     figure.savefig(path)
 
 
-def draw_track(
-    path: Path, curve_um: NDArray[np.float64], panels: dict[str, dict[str, LemniscateRun]], period_s: float
-) -> None:
+def draw_track(path: Path, curve_um: Floats, panels: dict[str, dict[str, LemniscateRun]], period_s: float) -> None:
     """Paths and errors, a column per panel: its title, flights by law; `curve_um` (n, 2) is the reference."""
     figure = new_figure(9.5, 6.4)
     axes = figure.subplots(2, len(panels), height_ratios=[1.35, 1.0], sharey="row", squeeze=False)

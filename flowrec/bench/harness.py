@@ -29,6 +29,8 @@ from flowrec.core import (
     FIGURE,
     JSON,
     Z95,
+    Bools,
+    Floats,
     FlowField,
     FlowrecError,
     Output,
@@ -196,7 +198,7 @@ def vessel_cases(folder: Path) -> list[Path]:
     return cases
 
 
-def flow_scores(found: FlowField, truth: NDArray[np.floating], mask: NDArray[np.bool_]) -> dict[str, float | None]:
+def flow_scores(found: FlowField, truth: NDArray[np.floating], mask: Bools) -> dict[str, float | None]:
     """Scores of a field over the components of the pixels of a mask (h, w); `truth` (h, w, 2) in um/s.
 
     error : relative RMSE of v. within_2_sigma : fraction of the components within two stated standard deviations of the
@@ -240,7 +242,7 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     return (0.0 if successes == 0 else middle - half), (1.0 if successes == count else middle + half)
 
 
-def paired_ratio(ratios: NDArray[np.float64]) -> Results:
+def paired_ratio(ratios: Floats) -> Results:
     """Geometric mean of paired ratios (n,), its bootstrap 95 % interval, and tests of the hypothesis that it is 1.
 
     The sign test and Wilcoxon's signed-rank test are two-sided; ties (ratio 1) count for neither side.

@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, Applied, Demand, Estimate, FlowField, Mission, Route, Track, seconds
+from flowrec.core import NS_PER_S, Applied, Demand, Estimate, Floats, FlowField, Mission, Route, Track, seconds
 from flowrec.physics import Robot
 from flowrec.stages import Controller, Observer
 
@@ -54,15 +53,15 @@ class RunDisturbances:
 class LemniscateRun:
     """A run, frame by frame, in um about the centre."""
 
-    time_s: NDArray[np.float64]  # (n,)
-    position_um: NDArray[np.float64]  # (n, 2)
-    reference_um: NDArray[np.float64]  # (n, 2)
-    progress_s: NDArray[np.float64]  # (n,)
-    demand_um_s: NDArray[np.float64]  # (n, 2)
-    flow_miss_um_s: NDArray[np.float64]  # (n,) error of the estimated flow
+    time_s: Floats  # (n,)
+    position_um: Floats  # (n, 2)
+    reference_um: Floats  # (n, 2)
+    progress_s: Floats  # (n,)
+    demand_um_s: Floats  # (n, 2)
+    flow_miss_um_s: Floats  # (n,) error of the estimated flow
 
     @property
-    def error_um(self) -> NDArray[np.float64]:
+    def error_um(self) -> Floats:
         """(n,) distance to the reference."""
         return np.asarray(np.hypot(*(self.reference_um - self.position_um).T))
 
@@ -73,7 +72,7 @@ def lemniscate(turns: int = 2) -> Route:
     return Route(0, 1, "lemniscate", True, "", place_um(time), time)
 
 
-def place_um(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def place_um(time_s: Floats) -> Floats:
     """(n, 2) position of the reference at times (n,)."""
     theta = 2.0 * np.pi * time_s / PERIOD_S
     spread = (1.0 + np.sin(theta) ** 2)[:, None]

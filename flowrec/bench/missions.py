@@ -19,7 +19,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import FigureFile, Results, choose_names, paired_ratio, print_rows, vessel_cases, wilson
@@ -27,6 +26,7 @@ from flowrec.bench.world_flights import WORLDS as FAULTS
 from flowrec.bench.world_flights import Given, in_world
 from flowrec.core import (
     Currents,
+    Floats,
     FlowField,
     FlowrecError,
     RigError,
@@ -127,7 +127,7 @@ class MissionLog:
     def __init__(self, limits: CommandLimits) -> None:
         self.beyond = 0
         self._limits = limits
-        self.began: tuple[int, NDArray[np.float64], Route] | None = None  # stamp, true position, route
+        self.began: tuple[int, Floats, Route] | None = None  # stamp, true position, route
         self.contacts = {"survey": 0, "navigate": 0}
         self.replans = 0
         self.squared_um2: list[float] = []  # distances to the reference
@@ -319,8 +319,8 @@ def able_robot(robot: Robot, simulated: Simulated) -> Robot:
 
 def optimum_s(
     truth: FlowField,
-    start_um: NDArray[np.float64],
-    goal_um: NDArray[np.float64],
+    start_um: Floats,
+    goal_um: Floats,
     tolerance_um: float,
     chip: Chip,
     robot: Robot,

@@ -12,12 +12,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from flowrec.bench.figures import draw_observer
 from flowrec.bench.harness import FigureFile, Results, Seed
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, RATE_HZ, SPIN_PER_S, place_um, vortex_map
-from flowrec.core import Applied, Estimate, FlowField, Health, Track, progress, say, seconds, table
+from flowrec.core import Applied, Estimate, Floats, FlowField, Health, Track, progress, say, seconds, table
 from flowrec.measure import tune
 from flowrec.physics import Robot, sample
 from flowrec.stages import OBSERVERS, HealthMonitor, Kalman, Luenberger, Observer, smooth, with_row
@@ -29,8 +28,6 @@ GAINS_PER_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # tried of the Luenberger obs
 MAP_SCALE = 1.1  # of the map over the true flow: a tenth too fast
 PULSATION_HZ = 1.0
 DRAWN = "10 um"
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

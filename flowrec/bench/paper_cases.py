@@ -28,7 +28,7 @@ from flowrec.bench.track import FIXED_PACE, LAWS, WORLDS, flight, score
 from flowrec.bench.trips import SPEED_UM_S, Points, Trip, TripCase, best_time, draw_trip, worlds
 from flowrec.bench.vessel_truth import read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case
-from flowrec.core import FlowError, FlowField, Observations, Tick, seconds
+from flowrec.core import Bools, Floats, FlowError, FlowField, Observations, Tick, seconds
 from flowrec.physics import sample
 from flowrec.stages import PLANNERS, PiUnet, Refiner
 
@@ -199,7 +199,7 @@ def sensitivity(seed: int, data: Path | None, varied: str, level: float, method:
     return _refine_arrays(arrays, method, traced=False)
 
 
-def swim_energy(field: FlowField, waypoints_um: Points, arrival_s: NDArray[np.float64]) -> float:
+def swim_energy(field: FlowField, waypoints_um: Points, arrival_s: Floats) -> float:
     """Integral of |u|^2 + idle^2 over a route, um2/s, with the own speed u; the cost of plan.cost = "energy".
 
     At `idle`, half of the robot's speed, swimming takes as much power as everything else.
@@ -267,7 +267,7 @@ def _branch(places: Points, known: FlowField | None) -> str | None:
 
 
 def _picture(
-    velocity_um_s: NDArray[np.floating], fluid: NDArray[np.bool_], um_per_px: float, top_um_s: float | None = None
+    velocity_um_s: NDArray[np.floating], fluid: Bools, um_per_px: float, top_um_s: float | None = None
 ) -> Results:
     """The speed as an image for a figure: rows of numbers from 0 to 1 of `top_um_s`; -1 in solid."""
     speed = np.linalg.norm(velocity_um_s.astype(np.float64), axis=-1)
@@ -291,7 +291,7 @@ def _least_time(seed: int, ratio: float, way: str) -> float:
     return best_time(world, world.field(ratio), *drawn.ends(way), SPEED_UM_S)[0]
 
 
-def _full_speed(field: FlowField, waypoints_um: Points) -> NDArray[np.float64]:
+def _full_speed(field: FlowField, waypoints_um: Points) -> Floats:
     from flowrec.stages import travel_time
 
     return travel_time(field, waypoints_um, SPEED_UM_S)[0]
@@ -308,7 +308,7 @@ def _vessel(seed: int, vessels: str, data: Path | None) -> dict[str, Any]:
     raise AssertionError("count has no end")
 
 
-def _crop(data: Path | None, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _crop(data: Path | None, rng: np.random.Generator) -> Bools:
     """128 x 128 pixels of a mask in `data`/masks, at a scale at which vessels are a few to 15 pixels wide."""
     assert data is not None
     files = sorted((data / "masks").glob("*.png"))
@@ -321,7 +321,7 @@ def _crop(data: Path | None, rng: np.random.Generator) -> NDArray[np.bool_]:
 
 
 @lru_cache(maxsize=20)
-def _mask(path: Path) -> NDArray[np.bool_]:
+def _mask(path: Path) -> Bools:
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) > 0
 
 

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.bench.figures import colours
 from flowrec.bench.harness import Results
 from flowrec.bench.paper_rows import mean_of, select
-from flowrec.core import MM_PER_UM, replacing
+from flowrec.core import MM_PER_UM, Floats, replacing
 from flowrec.exports import style
 
 if TYPE_CHECKING:
@@ -330,7 +329,7 @@ def _show(ax: Axes, image: Iterable[float], width: int, um_per_px: float = 0.0, 
     ax.imshow(shown, cmap=colour_map, vmin=0.0, vmax=1.0, extent=extent, interpolation="nearest")
 
 
-def _pixels(image: Iterable[float], width: int) -> NDArray[np.float64]:
+def _pixels(image: Iterable[float], width: int) -> Floats:
     return np.asarray(image, np.float64).reshape(-1, int(width))
 
 

@@ -13,13 +13,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M, Bools, Floats
 from flowrec.physics import Chip, Opening, Walls, newton_equations, system
-
-Array = NDArray[np.float64]
 
 # fmt: off
 # Between the walls, whose values are known.
@@ -88,7 +85,7 @@ def cavity_case(cells: int, reynolds: int) -> dict[str, Any]:
     }
 
 
-def _solve(cells: int, reynolds: float) -> tuple[Array, Array]:
+def _solve(cells: int, reynolds: float) -> tuple[Floats, Floats]:
     """Velocities u (cells, cells + 1) and v (cells + 1, cells) of faces over that of the lid, which is the top row."""
     box = Chip("cavity", np.ones((cells, cells), bool), UM_PER_M / cells, (), 1.0, 1.0, walls="pixel")
     equations = newton_equations(box, 1)
@@ -143,7 +140,7 @@ def _chip(px_per_diameter: int, walls: Walls) -> tuple[Chip, float]:
 
 
 def _force(
-    u: Array, v: Array, p: Array, box: tuple[int, int, int, int], h: float, mu: float, rho: float
+    u: Floats, v: Floats, p: Floats, box: tuple[int, int, int, int], h: float, mu: float, rho: float
 ) -> tuple[float, float]:
     """Force per depth (N/m) along columns and rows on the body in the box, by the balance of momentum.
 
@@ -160,7 +157,7 @@ def _force(
 
 
 def _sides(
-    u: Array, v: Array, p: Array, ends: tuple[int, int], span: tuple[int, int], h: float, mu: float, rho: float
+    u: Floats, v: Floats, p: Floats, ends: tuple[int, int], span: tuple[int, int], h: float, mu: float, rho: float
 ) -> Iterator[tuple[float, float]]:
     """Momentum through the two sides of the box that are normal to u: its components along u and along v."""
     top, low = span
@@ -176,7 +173,7 @@ def _sides(
         yield normal, outward * h * float((rho * w * cross - mu * shear).sum())
 
 
-def _at_wall(p: Array, fluid: NDArray[np.bool_], row: float, wall: float, step: int) -> float:
+def _at_wall(p: Floats, fluid: Bools, row: float, wall: float, step: int) -> float:
     """Pressure at the wall (in cells along the row), extrapolated from the first three cells away from it."""
     upper = int(np.floor(row))
     share = row - upper

@@ -12,17 +12,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.bench.trips import SPEED_UM_S, Points, TripCase
-from flowrec.core import FlowField, Route, bilinear, compiled, table
+from flowrec.core import Floats, FlowField, Route, bilinear, compiled, table
 from flowrec.physics import clearance_um
 from flowrec.stages import Planner, travel_time
 
 FASTER = 1.1  # the true flow over the assumed one
 _TIME_LIMIT_S = 100.0  # of a driven policy
 _STEP_PX = 0.1
-Raster = NDArray[np.float64]
 Lines = list[dict[str, Any]]
 
 
@@ -163,7 +161,7 @@ def drive(
 
 
 @compiled
-def _heading(times: Raster, x: float, y: float) -> tuple[float, float]:
+def _heading(times: Floats, x: float, y: float) -> tuple[float, float]:
     """The direction of -grad T from the pixels around a point; (0, 0) if too few are known."""
     h, w = times.shape
     i = min(max(int(x), 0), w - 2)
@@ -188,8 +186,8 @@ def _heading(times: Raster, x: float, y: float) -> tuple[float, float]:
 
 @compiled
 def _drive(
-    times: Raster, finer: float, vx: Raster, vy: Raster, ends: Raster, speed: float, within: float, time_limit: float
-) -> tuple[float, Raster]:
+    times: Floats, finer: float, vx: Floats, vy: Floats, ends: Floats, speed: float, within: float, time_limit: float
+) -> tuple[float, Floats]:
     x, y, goal_x, goal_y = ends
     h, w = vx.shape
     path = np.empty((20000, 2))

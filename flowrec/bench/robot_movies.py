@@ -13,9 +13,8 @@ from functools import partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Image, pixel_type
+from flowrec.core import Floats, Image, pixel_type
 
 _FINE = 4  # samples per pixel side
 
@@ -25,7 +24,7 @@ class RobotMovie:
     """Images (uint8 up to 8 bits, else uint16), true centres (n, 2) in px, and what a user knows."""
 
     images: list[Image]
-    centres_px: NDArray[np.float64]
+    centres_px: Floats
     radius_px: float
     bits: int = 8
     box: bool = False  # elongated: marked by a box, not by a click
@@ -54,18 +53,18 @@ class Exposure:
     vignette: float = 0.0
 
 
-Drawing = Callable[[NDArray[np.float64], NDArray[np.float64], int], NDArray[np.float64]]
+Drawing = Callable[[Floats, Floats, int], Floats]
 
 
 def movie(
     draw: Drawing,
-    path: NDArray[np.float64],
+    path: Floats,
     radius_px: float,
     exposure: Exposure,
     *,
     size: tuple[int, int] = (160, 200),
     blur_px: float = 0.9,
-    neighbours: NDArray[np.float64] | None = None,
+    neighbours: Floats | None = None,
     box: bool = False,
     seed: int = 0,
 ) -> RobotMovie:
@@ -114,7 +113,7 @@ def spot(sigma: float) -> Drawing:
 def ring(radius: float, focus_per_frame: float = 0.0) -> Drawing:
     """Bright centre, dark ring, faint bright halo, as in phase contrast; the centre fades and widens out of focus."""
 
-    def draw(dx: NDArray[np.float64], dy: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
+    def draw(dx: Floats, dy: Floats, frame: int) -> Floats:
         rho, focus = np.hypot(dx, dy) / radius, focus_per_frame * frame
         centre = (1.0 - 0.6 * focus) * np.exp(-((rho / (0.55 + 0.25 * focus)) ** 2))
         return (
@@ -129,7 +128,7 @@ def ring(radius: float, focus_per_frame: float = 0.0) -> Drawing:
 def janus(radius: float, turn_per_frame: float, bright: float = 0.8) -> Drawing:
     """Half dark, half bright disc that turns in the plane and, slower, out of it."""
 
-    def draw(dx: NDArray[np.float64], dy: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
+    def draw(dx: Floats, dy: Floats, frame: int) -> Floats:
         angle = turn_per_frame * frame
         tilt = 0.8 * math.sin(0.37 * angle)
         across = (dx * math.cos(angle) + dy * math.sin(angle)) / radius
@@ -145,7 +144,7 @@ def helix(
 ) -> Drawing:
     """Projection of a helical filament that rolls about its axis and turns in the plane."""
 
-    def draw(dx: NDArray[np.float64], dy: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
+    def draw(dx: Floats, dy: Floats, frame: int) -> Floats:
         angle, phase = 0.4 + turn_per_frame * frame, roll_per_frame * frame
         along = dx * math.cos(angle) + dy * math.sin(angle)
         across = -dx * math.sin(angle) + dy * math.cos(angle)
@@ -160,21 +159,21 @@ def helix(
 
 def wander(
     frames: int, start: tuple[float, float], velocity: tuple[float, float], diffusion_px: float, seed: int = 1
-) -> NDArray[np.float64]:
+) -> Floats:
     """Path (frames, 2): a drift in px per frame and a random walk; the first point is the start."""
     steps = np.asarray(velocity) + diffusion_px * np.random.default_rng(seed).standard_normal((frames, 2))
     steps[0] = 0.0
     return np.asarray(start, np.float64) + np.cumsum(steps, axis=0)
 
 
-def _jumps(frames: int, radius_px: float, radii: float) -> NDArray[np.float64]:
+def _jumps(frames: int, radius_px: float, radii: float) -> Floats:
     path = wander(frames, (60.0, 60.0), (0.3, 0.2), 0.1 * radius_px)
     for frame in range(10, frames, 10):
         path[frame:] += radii * radius_px * np.array([1.0, 0.0] if (frame // 10) % 2 else [-0.6, 0.8])
     return path
 
 
-def _crossing(frames: int, apart_px: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _crossing(frames: int, apart_px: float) -> tuple[Floats, Floats]:
     """The robot passes between and beside objects that look the same, two of which cross its way."""
     rng = np.random.default_rng(5)
     robot = wander(frames, (30.0, 80.0), (2.0, 0.0), 0.25)

@@ -12,11 +12,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.bench.harness import print_rows
 from flowrec.bench.robot_movies import RobotMovie, judges
-from flowrec.core import Appearance, Frame, Image, Track, UsageError
+from flowrec.core import Appearance, Floats, Frame, Image, Track, UsageError
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages import Tracker
 
@@ -24,7 +23,7 @@ _RATE_HZ = 25.0
 _MOST_RADII = 3.0  # that a robot moves between two frames: its greatest speed, which all methods are told
 _SWITCHED_RADII = 1.5  # an error beyond this is that of another object
 
-Found = tuple[NDArray[np.float64], NDArray[np.float64]]  # positions (n, 2) in px, NaN where not seen; ms (n,) of CPU
+Found = tuple[Floats, Floats]  # positions (n, 2) in px, NaN where not seen; ms (n,) of CPU
 Method = Callable[[RobotMovie], Found]
 
 

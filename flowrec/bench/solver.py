@@ -7,13 +7,12 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.bench.complex_fluids import LAWS, law_bend_case, law_channel_case, law_oblique_case, law_speed_case
 from flowrec.bench.exact_flows import bend_case, oblique_case, straight_case
 from flowrec.bench.harness import Quick, Results, print_rows
 from flowrec.bench.published_flows import cavity_case, cylinder_case
-from flowrec.core import peak_mb, pool, progress
+from flowrec.core import Bools, peak_mb, pool, progress
 from flowrec.physics import (
     Chip,
     FlowSolver,
@@ -143,7 +142,7 @@ def _speed(pattern: Pattern, side_px: int, k: int) -> dict[str, Any]:
     }
 
 
-def _mask(pattern: Pattern, side: int) -> NDArray[np.bool_]:
+def _mask(pattern: Pattern, side: int) -> Bools:
     if pattern == "vessels":
         drawn = vessels(1).mask[:, :256]
         at = np.arange(side) * 256 // side

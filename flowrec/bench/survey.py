@@ -15,13 +15,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from flowrec.bench.flow import make_up
 from flowrec.bench.harness import Cases, Names, Results, choose_names, print_rows, vessel_cases
 from flowrec.bench.vessel_truth import NOISES, read_observations, read_true_velocity
 from flowrec.bench.vessels import thin
-from flowrec.core import FlowError, FlowField, Observations, Route, nearest_pixels, progress, say
+from flowrec.core import Floats, FlowError, FlowField, Observations, Route, nearest_pixels, progress, say
 from flowrec.physics import Chip, Doubts, FlowSolver, FlowUncertainty, relative_rmse, sample
 from flowrec.stages import (
     Need,
@@ -37,7 +36,7 @@ from flowrec.stages import (
 
 RANDOM_CASES = 20  # made up where no folder of cases is given
 _MOST_STRETCHES = 60  # of a route; a survey that asks for more is ended
-Points = NDArray[np.float64]
+Points = Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

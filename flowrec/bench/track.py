@@ -13,14 +13,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from flowrec.bench.figures import draw_track
 from flowrec.bench.harness import FigureFile, Results, print_rows
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, LemniscateRun, RunDisturbances, fly, lemniscate
 from flowrec.bench.robot_tracking import show_rows, tracking_rows
-from flowrec.core import progress, table
+from flowrec.core import Floats, progress, table
 from flowrec.stages import CONTROLLERS, OBSERVERS, Controller, Kalman, Observer, with_row
 
 V_MAX_UM_S = 1000.0
@@ -158,7 +157,7 @@ def _converged_s(flight: LemniscateRun) -> float | None:
     return float(flight.time_s[out[-1] + 1]) if out[-1] + 1 < len(flight.time_s) - _LAST_FRAMES else None
 
 
-def _rms(values: NDArray[np.float64]) -> float:
+def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from flowrec.bench.vessels import draw_mask
-from flowrec.core import FlowField, FlowrecError
+from flowrec.core import Floats, FlowField, FlowrecError
 from flowrec.physics import Chip, FlowSolver, Robot, find_openings, read_vessel_case
 from flowrec.stages import SPACING_PX, descend, open_space, refine_path, time_field, travel_time
 
@@ -19,7 +18,7 @@ SPEED_UM_S = 1000.0  # the robot's; flows are scaled to it
 UM_PER_PX = 20.0
 FINER = 8  # pixels of the reference per pixel side; time_field uses at most four
 _EIGHT = np.ones((3, 3), np.int64)
-Points = NDArray[np.float64]
+Points = Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,9 +6,8 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Observations
+from flowrec.core import Floats, Observations
 from flowrec.physics import Chip, read_case
 
 # Noise levels and shares of the skeleton that cases hold, by the names in their keys.
@@ -47,18 +46,18 @@ def read_true_chip(path: Path, believed: Chip) -> Chip:
     return believed.with_boundary(values, float(known["mu"]) * 1e3, float(known["rho"]))
 
 
-def read_true_velocity(path: Path) -> NDArray[np.float64]:
+def read_true_velocity(path: Path) -> Floats:
     """The true velocity (h, w, 2) in um/s at the pixel centres, for scoring alone."""
     return (_at_centres(path) if _holds_means(path) else _velocity(path, _MEANS)) * 1e6
 
 
-def read_true_pressure(path: Path) -> NDArray[np.float64] | None:
+def read_true_pressure(path: Path) -> Floats | None:
     """The true pressure (h, w) in Pa, for scoring alone; None where the case does not have it."""
     with np.load(path, allow_pickle=False) as case:
         return np.asarray(case["p"], np.float64) if "p" in case.files else None
 
 
-def _at_centres(path: Path) -> NDArray[np.float64]:
+def _at_centres(path: Path) -> Floats:
     """Values at the pixel centres where vx, vy are means over a pixel, and vx_c, vy_c over half of its width.
 
     A mean over a square of width h is the value in its middle plus h^2 / 24 lap v: the two means give both terms.
@@ -67,7 +66,7 @@ def _at_centres(path: Path) -> NDArray[np.float64]:
     return half + (half - _velocity(path, _MEANS)) / 3.0
 
 
-def _velocity(path: Path, keys: tuple[str, str]) -> NDArray[np.float64]:
+def _velocity(path: Path, keys: tuple[str, str]) -> Floats:
     known = read_case(path, keys)
     return np.stack([known[key] for key in keys], axis=-1).astype(np.float64)
 

@@ -19,7 +19,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, labe
 from scipy.sparse.csgraph import dijkstra
 
 from flowrec.bench.vessel_truth import NOISES, SHARES
-from flowrec.core import FlowrecError
+from flowrec.core import Bools, Floats, FlowrecError, Ints
 from flowrec.physics import (
     Chip,
     FlowSolver,
@@ -33,7 +33,7 @@ from flowrec.physics import (
 )
 
 SIDE_PX = 128
-Mask = NDArray[np.bool_]
+Mask = Bools
 
 
 def photograph(mask: Mask, blur_px: float = 1.0, finer: int = 1) -> NDArray[np.uint8]:
@@ -84,14 +84,14 @@ def draw_mask(rng: np.random.Generator, side_px: int = SIDE_PX) -> Mask:
     """Draw a vessel tree with some loops: a trunk from border to border, then branches that start on a vessel."""
     gap = np.full((side_px, side_px), np.inf)
 
-    def border_point() -> NDArray[np.float64]:
+    def border_point() -> Floats:
         place = rng.uniform(0.1, 0.9) * side_px
         beyond = 10.0
         return np.array(
             [(-beyond, place), (side_px + beyond, place), (place, -beyond), (place, side_px + beyond)][rng.integers(4)]
         )
 
-    def draw(a: NDArray[np.float64], b: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+    def draw(a: Floats, b: Floats, width: float) -> Floats:
         t = np.linspace(0.0, 1.0, 5)[:, None]
         along = b - a
         across = np.array([-along[1], along[0]])
@@ -143,7 +143,7 @@ def make_case(mask: Mask, rng: np.random.Generator, truth_k: int = 4) -> dict[st
     true_u = np.full(len(openings), np.nan)
     true_u[inlets] = speed * rng.uniform(0.8, 1.2, len(inlets))
 
-    def chip(u: NDArray[np.float64], p: NDArray[np.float64]) -> Chip:
+    def chip(u: Floats, p: Floats) -> Chip:
         made = tuple(
             replace(o, kind="inlet", value=float(u[i] * 1e6)) if i in inlets else replace(o, value=float(p[i]))
             for i, o in enumerate(openings)
@@ -182,9 +182,7 @@ def make_case(mask: Mask, rng: np.random.Generator, truth_k: int = 4) -> dict[st
     return case | _route_observations(velocity, route, int(skeleton.sum()), rng)
 
 
-def _route_observations(
-    velocity: NDArray[np.float64], route: NDArray[np.intp], skeleton_px: int, rng: np.random.Generator
-) -> dict[str, Any]:
+def _route_observations(velocity: Floats, route: Ints, skeleton_px: int, rng: np.random.Generator) -> dict[str, Any]:
     """Noisy velocities on the pixels of a route (n, 2), and the indices that are observed, by key of a vessel case."""
     on_way = velocity[route[:, 0], route[:, 1]]
     rms = float(np.sqrt((on_way**2).sum(axis=1).mean()))
@@ -251,7 +249,7 @@ def _without_grazed(mask: Mask, openings: list[Opening]) -> Mask:
     return _largest(closed)
 
 
-def _route(skeleton: Mask, openings: list[Opening], rng: np.random.Generator) -> NDArray[np.int64] | None:
+def _route(skeleton: Mask, openings: list[Opening], rng: np.random.Generator) -> Ints | None:
     """(n, 2) rows and columns of the shortest path along the skeleton between two random openings; None if short."""
     rows, columns = np.nonzero(skeleton)
     if len(rows) < 60:

@@ -22,6 +22,7 @@ from flowrec.bench.second_worlds import SECOND_WORLDS, make_survey
 from flowrec.core import (
     BY_FIELD,
     NO_EXTRA,
+    Bools,
     Floats,
     FlowField,
     FlowrecError,
@@ -245,7 +246,7 @@ class Judged:
     assumed: FlowField
     refine_by: Callable[[str], FlowField]
     truth_um_s: NDArray[np.floating]  # (h, w, 2)
-    fluid: NDArray[np.bool_]  # (h, w) where it is compared
+    fluid: Bools  # (h, w) where it is compared
     planted: Sequence[str]
     seen_um: Floats  # (n, 2) where the flow was observed
 

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core.declarations import Bools, Floats
+from flowrec.core.declarations import Bools, Floats, Ints
 from flowrec.core.system.numba_setup import compiled
 
 LEAST_WEIGHT = 0.25  # of the pixels with a value, for a point to have one
@@ -41,10 +41,10 @@ LEAST_WEIGHT = 0.25  # of the pixels with a value, for a point to have one
 class Cells:
     """The four pixels around each of a number of points."""
 
-    row: NDArray[np.intp]  # (...) of the upper two pixels
-    column: NDArray[np.intp]  # (...) of the left two
-    below: NDArray[np.intp]  # (...) row of the lower two; that of the upper ones in a raster of one row
-    right: NDArray[np.intp]  # (...) column of the right two; that of the left ones in a raster of one column
+    row: Ints  # (...) of the upper two pixels
+    column: Ints  # (...) of the left two
+    below: Ints  # (...) row of the lower two; that of the upper ones in a raster of one row
+    right: Ints  # (...) column of the right two; that of the left ones in a raster of one column
     a: Floats  # (...) fraction 0 to 1 along x
     b: Floats  # (...) fraction 0 to 1 along y
     inside: Bools  # (...) finite, and at most half a pixel beyond the outermost pixel centres
@@ -72,12 +72,12 @@ class Cells:
         return np.where(enough, total / np.maximum(known, LEAST_WEIGHT), np.inf)
 
     @property
-    def rows(self) -> NDArray[np.intp]:
+    def rows(self) -> Ints:
         """(..., 4) rows of the pixels 00, 01, 10, 11."""
         return np.stack([self.row, self.row, self.below, self.below], axis=-1)
 
     @property
-    def columns(self) -> NDArray[np.intp]:
+    def columns(self) -> Ints:
         """(..., 4) columns of the pixels 00, 01, 10, 11."""
         return np.stack([self.column, self.right, self.column, self.right], axis=-1)
 
@@ -88,7 +88,7 @@ class Cells:
         return np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b], axis=-1)
 
 
-def _gather(raster: NDArray[Any], row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[Any]:
+def _gather(raster: NDArray[Any], row: Ints, column: Ints) -> NDArray[Any]:
     """raster[row, column]; NumPy gathers pixels of several channels in a quarter of the time by one index of each."""
     if not raster.flags.c_contiguous:
         return np.asarray(raster[row, column])
@@ -135,7 +135,7 @@ def nearest_pixel(x: float, y: float, shape: tuple[int, ...]) -> tuple[int, int]
     return min(max(round(y), 0), h - 1), min(max(round(x), 0), w - 1)
 
 
-def nearest_pixels(points: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def nearest_pixels(points: Floats, shape: tuple[int, ...]) -> tuple[Ints, Ints]:
     """Rows (...) and columns (...) of the pixels nearest to finite points (..., 2) in px, as `nearest_pixel`."""
     h, w = shape[:2]
     nearest = np.rint(points).astype(np.intp)

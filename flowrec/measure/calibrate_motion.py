@@ -14,6 +14,7 @@ from flowrec.core import (
     Z95,
     Coverage,
     Currents,
+    Floats,
     FlowField,
     Ints,
     UsageError,
@@ -35,7 +36,7 @@ from flowrec.measure.motion_search import SearchRange
 from flowrec.measure.proposal import as_sets, as_toml, check_outputs, write_outputs
 from flowrec.measure.speed_table import fit_speed_table, proportional_log, propose_table
 from flowrec.physics import Robot
-from flowrec.stages import LAB, MOVIE, FieldCommand, FieldLog, FieldState, Floats, field_motion, read_coil_log
+from flowrec.stages import LAB, MOVIE, FieldCommand, FieldLog, FieldState, field_motion, read_coil_log
 from flowrec.store import Session, files_behind
 
 # A log on another clock: any offset, and rates of 30 % to either side.

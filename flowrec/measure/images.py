@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Coverage, Floats, Image, UsageError
+from flowrec.core import Bools, Coverage, Floats, Floats32, Image, UsageError
 from flowrec.movies import ReadOptions, median_of, open_movie
 from flowrec.rigs import sha256_of
 from flowrec.store import open as open_session
 
-Levels = NDArray[np.float32]  # grey levels, or what is computed of them
-Mask = NDArray[np.bool_]
+Levels = Floats32  # grey levels, or what is computed of them
+Mask = Bools
 Colours = NDArray[np.uint8]  # (h, w, 3), blue first
 ORANGE = (0, 140, 255)  # blue, green, red
 _IMAGES = 31  # of a session, for the median

@@ -20,14 +20,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import exp1
 
-from flowrec.core import FlowField, UsageError
+from flowrec.core import Floats, FlowField, Ints, UsageError
 from flowrec.measure.motion_regression import MotionRegression, Place, TrackRegression, Turns, heading_and_size
 from flowrec.measure.motion_search import SearchRange, search
 from flowrec.physics import sample
-from flowrec.stages import FREEDOM, RESTART, SKIPPED, USED, Flags, Floats, fit_noise, whiten, without_jumps
+from flowrec.stages import FREEDOM, RESTART, SKIPPED, USED, Flags, fit_noise, whiten, without_jumps
 
 # Of 72 simulated missions all pass with their own log, which explains 0.73 to 0.97. Of 288 comparisons with logs of
 # other runs, which explain 0 to 0.5 in most cases, 2 pass: on the same chip, where the commands are nearly the same and
@@ -270,7 +270,7 @@ def _stretches(time_s: Floats, positions_um: Floats) -> Flags:
     return flags
 
 
-def _skip_excursions(flags: Flags, kept: NDArray[np.intp], starts: NDArray[np.intp]) -> None:
+def _skip_excursions(flags: Flags, kept: Ints, starts: Ints) -> None:
     """Skip what lies between two jumps if it is short: the track went to something else and came back.
 
     Parameters
@@ -298,7 +298,7 @@ def _off_neighbours(velocity: Floats) -> Floats:
     return np.pad(np.hypot(*(here - nearest).T), 1)
 
 
-def _spikes(time_s: Floats, positions_um: Floats) -> NDArray[np.intp]:
+def _spikes(time_s: Floats, positions_um: Floats) -> Ints:
     """Positions far from the line between their neighbours, where these lie on that between theirs.
 
     Before the noise is known: a few wrong positions in a hundred make it look so large that no command is seen.

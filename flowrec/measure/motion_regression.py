@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit  # quantile of Student's t; scipy.stats takes 0.3 s to load
 
-from flowrec.core import Z95
-from flowrec.stages import FREEDOM, Flags, Floats, NoiseModel, whiten
+from flowrec.core import Z95, Floats
+from flowrec.stages import FREEDOM, Flags, NoiseModel, whiten
 
 Complex = NDArray[np.complex128]
 # (n,) times of the log in s to (n, 2) revolutions along x and y since its first row.

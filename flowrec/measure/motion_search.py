@@ -16,8 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import fft
 
+from flowrec.core import Floats
 from flowrec.measure.motion_regression import TrackRegression, Turns
-from flowrec.stages import Floats, whiten
+from flowrec.stages import whiten
 
 _LEAST_OVERLAP = 0.5  # of the shorter of movie and log
 _RATE_STEP = 0.6  # frames by which the ends of the movie move at most between two rates of the search

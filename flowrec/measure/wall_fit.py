@@ -30,15 +30,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import STD_PER_MAD, TUKEY, Floats
+from flowrec.core import STD_PER_MAD, TUKEY, Floats, Ints
 from flowrec.measure.images import Levels, blur_image, gradient, shrink
 from flowrec.measure.wall_search import WallMap, move_chip
 from flowrec.physics import Calibration
 
 Stages = tuple[tuple[float, int, float], ...]
-Indices = NDArray[np.intp]
 _LONGEST_PX = 1280  # side of the image that is fitted
 # Blur, most pixels, and the motion in px at which Gauss-Newton ends; one row after the other.
 _STAGES = ((4.0, 30_000, 0.05), (2.0, 30_000, 0.05), (1.0, 30_000, 0.02), (0.0, 100_000, 0.003))
@@ -351,12 +349,12 @@ class _Model:
         return share, residual, inverse @ (parts.T @ parts) @ inverse
 
 
-def _sums(places: Indices, values: Floats, count: int) -> Floats:
+def _sums(places: Ints, values: Floats, count: int) -> Floats:
     """(count,) sums of the values (n,) at each place."""
     return np.asarray(np.bincount(places, values, count), np.float64)
 
 
-def _correlation(a: Floats, b: Floats, weight: Indices) -> Floats:
+def _correlation(a: Floats, b: Floats, weight: Ints) -> Floats:
     """Weighted correlation of the rows of a and b."""
     total = np.maximum(weight.sum(1, keepdims=True), 1)
     a = a - (weight * a).sum(1, keepdims=True) / total

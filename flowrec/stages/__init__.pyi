@@ -27,7 +27,7 @@ from .estimation.pump import as_planned as as_planned
 from .estimation.sampler import SAMPLERS as SAMPLERS, Trimmed as Trimmed
 from .estimation.smoother import observe as observe, smooth as smooth
 from .estimation.whitening import (
-    FREEDOM as FREEDOM, Flags as Flags, Floats as Floats, NoiseModel as NoiseModel, RESTART as RESTART,
+    FREEDOM as FREEDOM, Flags as Flags, NoiseModel as NoiseModel, RESTART as RESTART,
     SKIPPED as SKIPPED, USED as USED, fit_noise as fit_noise, whiten as whiten, without_jumps as without_jumps,
 )
 from .extra_topics import ExtraRow as ExtraRow, extra_rows as extra_rows, topics_of as topics_of

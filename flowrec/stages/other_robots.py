@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     WALLS,
     Applied,
     Demand,
     Estimate,
+    Floats,
+    Floats32,
     FlowField,
     Message,
     Observations,
@@ -95,7 +96,7 @@ class OtherRobots:
         estimates: Sequence[Estimate],
         robot: Robot,
         radii_um: Sequence[float],
-        clearance_um: NDArray[np.float32],
+        clearance_um: Floats32,
         um_per_px: float,
     ) -> RobotWalls:
         """Distances of the other robots (n) from walls, by the command of the tick before.
@@ -136,7 +137,7 @@ def _with_unknown_response(made: Observations, past: Estimate, now: Estimate, ro
     return replace(made, std_um_s=std_um_s)
 
 
-def _command_of(demand: Demand | None, estimate: Estimate, robot: Robot) -> NDArray[np.float64]:
+def _command_of(demand: Demand | None, estimate: Estimate, robot: Robot) -> Floats:
     """Velocity (2,) through the fluid that the last command gives another robot, um/s."""
     if demand is None:
         return np.zeros(2)
@@ -145,8 +146,8 @@ def _command_of(demand: Demand | None, estimate: Estimate, robot: Robot) -> NDAr
 
 
 def _wall(
-    estimate: Estimate, track: Track, radius_um: float, clearance_um: NDArray[np.float32], um_per_px: float
-) -> tuple[float, NDArray[np.float64]]:
+    estimate: Estimate, track: Track, radius_um: float, clearance_um: Floats32, um_per_px: float
+) -> tuple[float, Floats]:
     """Distance from the surface of a robot to the nearest wall, and the direction (2,) away from it; NaN if unknown."""
     unknown = track.seen_ns is None or seconds(track.stamp_ns - track.seen_ns) > _SEEN_S
     if unknown or not np.isfinite(estimate.position_um).all():

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     FIXED,
@@ -21,6 +20,7 @@ from flowrec.core import (
     AxesCheck,
     Estimate,
     Floats,
+    Floats32,
     FlowField,
     Message,
     Observations,
@@ -68,7 +68,7 @@ class Pipeline:
     calibration: Calibration
     robot: Robot  # in proportion to the frequency, see physics.Robot
     response: Robot  # as the coils drive it
-    clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
+    clearance_um: Floats32  # (h, w) from each pixel centre to the nearest wall, negative in solid
     image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
     image_bits: int  # depth of their pixels
     stabiliser: Stabiliser

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import NS_PER_S, Floats, Floats32, Image
+from flowrec.core import NS_PER_S, Floats, Floats32, Image, Ints
 from flowrec.store import nonzero_window
 from flowrec.view.colours import SOLID, Rgb
 
@@ -110,7 +110,7 @@ class Layer:
         picture.reshape(-1, 3)[where] = (levels * (1.0 - ink[:, 3:]) + ink[:, :3] + 0.5).astype(np.uint8)
 
     @functools.cached_property
-    def _finished(self) -> tuple[NDArray[np.intp], Floats32]:
+    def _finished(self) -> tuple[Ints, Floats32]:
         """Places of the pixels that have lines, and their ink."""
         where = np.flatnonzero(self._ink[..., 3])
         return where, self._ink.reshape(-1, 4)[where]

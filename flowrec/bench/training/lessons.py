@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.bench.vessel_truth import NOISES, SHARES, read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
-from flowrec.core import FlowField, FlowrecError, Observations, UsageError, replacing
+from flowrec.core import Floats32, FlowField, FlowrecError, Ints, Observations, UsageError, replacing
 from flowrec.physics import Chip, FlowSolver, read_vessel_case
 from flowrec.stages import ObservationOperator, observation_operator
 
@@ -31,10 +30,10 @@ class Lesson:
 
     chip: Chip  # as assumed
     assumed: FlowField
-    velocity_um_s: NDArray[np.float32]  # (h, w, 2) true
+    velocity_um_s: Floats32  # (h, w, 2) true
     # (h, w) true, scaled to the assumed viscosity: the pressure that drives the true flow against it
-    pressure_pa: NDArray[np.float32]
-    route_px: NDArray[np.intp]  # (n, 2) row and column
+    pressure_pa: Floats32
+    route_px: Ints  # (n, 2) row and column
     skeleton_px: int  # pixels of the skeleton
 
     def observe(self, rng: np.random.Generator) -> Observations:

@@ -8,9 +8,19 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core.declarations import NOT_STATED, Bools, Matrix, Message, NanFloat, Shape, Vector, Vector2, array_fields
+from flowrec.core.declarations import (
+    NOT_STATED,
+    Bools,
+    Ints,
+    Matrix,
+    Message,
+    NanFloat,
+    Shape,
+    Vector,
+    Vector2,
+    array_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +169,7 @@ class Observations(Message):
         more = replace(tracers, rolled_um_s=np.zeros_like(tracers.flow_um_s))
         return replace(own.followed_by(more), stamp_ns=self.stamp_ns, radius_um=self.radius_um)
 
-    def only(self, which: slice | Bools | NDArray[np.intp]) -> Observations:
+    def only(self, which: slice | Bools | Ints) -> Observations:
         """Some of the observations, chosen by an index of arrays."""
         stated = {name: array for name, array in self._arrays().items() if array is not None}
         return replace(self, **{name: array[which] for name, array in stated.items()})

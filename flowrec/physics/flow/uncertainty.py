@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats
+from flowrec.core import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class FlowUncertainty:
         speed = float(np.sqrt((self.mean_um_s**2).sum()))
         return float(np.sqrt((self.std_um_s**2).sum())) / max(speed, 1e-300)
 
-    def effect(self, pixels: NDArray[np.intp], own_um_s: Floats) -> Floats:
+    def effect(self, pixels: Ints, own_um_s: Floats) -> Floats:
         """(m, 2, p + r + k) what a unit of each unknown, and each doubt, adds to the flow observed in m fluid pixels.
 
         `own_um_s` (m, 2) is the velocity of the robot through the fluid there.

@@ -14,16 +14,13 @@ it is linear in the velocities, so a place has weights on the pixels around it, 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import bilinear, compiled
+from flowrec.core import Floats, Floats32, Ints, bilinear, compiled
 
 SIZE = 8  # rows and columns of the weights: four for the cubic, and two more on each side for continued values
 _BEFORE = 3  # of them before the pixel to the upper left of the place
 _LEAST_DISTANCE = 0.02  # in steps, of a wall from a centre: nearer ones would need large weights; masks keep 0.1
 _STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))  # right, left, ...
-
-Floats = NDArray[np.float64]
 
 
 @compiled
@@ -33,7 +30,7 @@ def _wall_after(fluid: float, solid: float) -> float:
 
 
 @compiled
-def _is_known(wall_px: NDArray[np.float32], row: int, column: int) -> bool:
+def _is_known(wall_px: Floats32, row: int, column: int) -> bool:
     """True if a pixel has a value: it is fluid, or a neighbour is."""
     h, w = wall_px.shape
     if row < 0 or column < 0 or row >= h or column >= w:
@@ -46,7 +43,7 @@ def _is_known(wall_px: NDArray[np.float32], row: int, column: int) -> bool:
 
 
 @compiled
-def _add(weights: Floats, row: int, column: int, wall_px: NDArray[np.float32], j: int, i: int, weight: float) -> None:
+def _add(weights: Floats, row: int, column: int, wall_px: Floats32, j: int, i: int, weight: float) -> None:
     """Add the weight of pixel (j, i), continued from the fluid where it is solid; weights[0, 0] is (row, column)."""
     if weight == 0.0:
         return
@@ -98,7 +95,7 @@ def _line_weights(known: tuple[bool, bool, bool, bool], a: float) -> tuple[float
 
 
 @compiled
-def fill_weights(wall_px: NDArray[np.float32], x: float, y: float, weights: Floats) -> tuple[int, int]:
+def fill_weights(wall_px: Floats32, x: float, y: float, weights: Floats) -> tuple[int, int]:
     """Weights (SIZE, SIZE) of the pixels around a place in px; returns the row and column of weights[0, 0].
 
     `weights` is zero before. The raster has at least two rows and two columns. All weights in solid and beyond the
@@ -135,7 +132,7 @@ def fill_weights(wall_px: NDArray[np.float32], x: float, y: float, weights: Floa
 
 
 @compiled
-def velocity_at(velocity: NDArray[np.float32], wall_px: NDArray[np.float32], x: float, y: float) -> tuple[float, float]:
+def velocity_at(velocity: Floats32, wall_px: Floats32, x: float, y: float) -> tuple[float, float]:
     """Velocity at a place in px, of values (h, w, 2) at pixel centres. Bilinear for a `wall_px` of no pixels.
 
     Beyond the outermost centres the value of the nearest place between them holds.
@@ -157,7 +154,7 @@ def velocity_at(velocity: NDArray[np.float32], wall_px: NDArray[np.float32], x: 
 
 
 @compiled
-def velocities_at(velocity: NDArray[np.float32], wall_px: NDArray[np.float32], points: Floats) -> Floats:
+def velocities_at(velocity: Floats32, wall_px: Floats32, points: Floats) -> Floats:
     """Velocities (n, 2) at points (n, 2) in px; zero where a point is not finite or half a pixel beyond all centres."""
     h, w = velocity.shape[:2]
     found = np.zeros((len(points), 2))
@@ -169,7 +166,7 @@ def velocities_at(velocity: NDArray[np.float32], wall_px: NDArray[np.float32], p
 
 
 @compiled
-def stencils_at(wall_px: NDArray[np.float32], points: Floats) -> Floats:
+def stencils_at(wall_px: Floats32, points: Floats) -> Floats:
     """Weights (n, SIZE, SIZE) of the pixels around points (n, 2) in px; [0, 0] is _BEFORE before the upper left one."""
     weights = np.zeros((len(points), SIZE, SIZE))
     for n in range(len(points)):
@@ -177,7 +174,7 @@ def stencils_at(wall_px: NDArray[np.float32], points: Floats) -> Floats:
     return weights
 
 
-def pixel_weights(wall_px: NDArray[np.float32], points: Floats) -> tuple[NDArray[np.intp], Floats]:
+def pixel_weights(wall_px: Floats32, points: Floats) -> tuple[Ints, Floats]:
     """Pixels (n, m), as indices row by row, and weights (n, m) whose sum over pixels is the velocity at points (n, 2).
 
     The first of the pixels is the nearest one. Points are in px and inside the raster.

@@ -38,7 +38,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import Floats, Floats32, bilinear, compiled
 
@@ -50,8 +49,6 @@ _STAGNATION = 3.23  # force of a stagnation flow on a sphere at the wall over St
 _LAG_AT = np.log(np.array([0.003202, 0.005004, 0.0453, 0.1276, 0.5431, 1.3524, 2.7622, 9.0677]))
 _LAG = np.array([0.45022, 0.47861, 0.65375, 0.76692, 0.92185, 0.97768, 0.99436, 0.9997])
 _FARTHEST_WIDTHS = 4.0  # of the median channel: farther walls do not matter
-
-Rasters = NDArray[np.float32]
 
 
 @compiled
@@ -103,8 +100,8 @@ def hindered_velocity(
     own_y: float,
     flow: Floats,
     share: float,
-    clearance: Rasters,
-    walls: Rasters,
+    clearance: Floats32,
+    walls: Floats32,
     um_per_px: float,
     radius: float,
 ) -> tuple[float, float]:
@@ -143,13 +140,13 @@ class Hindrance:
     """Effect of the side walls on the robot: its strength, 0 to 1, and the walls (`walls_around`)."""
 
     share: float
-    walls: Rasters
+    walls: Floats32
 
 
 NO_HINDRANCE = Hindrance(0.0, np.zeros((3, 0, 0), np.float32))
 
 
-def walls_around(clearance_um: Floats32, um_per_px: float) -> Rasters:
+def walls_around(clearance_um: Floats32, um_per_px: float) -> Floats32:
     """(3, h, w): from wall to wall through a pixel, um, along its normal; cosine and sine of twice the normal's angle.
 
     `clearance_um` (h, w) is the distance of pixel centres to the nearest wall. In the middle of a channel, where that

@@ -15,7 +15,7 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, Floats32, FlowField, RigError
+from flowrec.core import Bools, Floats, Floats32, FlowField, RigError
 from flowrec.physics import Chip, clearance_um, median_width_um, sample
 from flowrec.rigs.simulated.microscope import blotches, outline_px
 
@@ -30,7 +30,7 @@ _WIDTHS = (0.6, 1.3)  # times the median, of a place to be blocked: wider ones a
 _FARTHEST_PX = 1.1  # largest level of a pixel centre, as the solver states it
 _BLOCK_LENGTH = 0.6  # half length of the obstacle along the channel, in widths
 
-Mask = NDArray[np.bool_]
+Mask = Bools
 
 
 def true_walls(

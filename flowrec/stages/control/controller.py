@@ -11,12 +11,12 @@ from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.core import (
     Demand,
     Estimate,
     Floats,
+    Floats32,
     FlowField,
     Method,
     Methods,
@@ -41,7 +41,7 @@ _MOST_WAYPOINTS = 16  # of those near the robot that are compared in a tick
 
 
 def wall_barrier(
-    demand_um_s: Floats, now: Situation, clearance_um: NDArray[np.float32], keep_um: float, per_s: float
+    demand_um_s: Floats, now: Situation, clearance_um: Floats32, keep_um: float, per_s: float
 ) -> tuple[Floats, bool]:
     """The demand within the speed limit that keeps the robot off the walls, and whether the limit reduced it.
 
@@ -69,7 +69,7 @@ def wall_barrier(
 
 @compiled
 def _narrowest_um(
-    waypoints_um: Floats, x_um: float, y_um: float, near_um: float, clearance_um: NDArray[np.float32], um_per_px: float
+    waypoints_um: Floats, x_um: float, y_um: float, near_um: float, clearance_um: Floats32, um_per_px: float
 ) -> float:
     """Least clearance at some 16 of the waypoints (n, 2) that are near a point; infinite if none is."""
     count = 0
@@ -95,7 +95,7 @@ def constrain(demand_um_s: Floats, flow_um_s: Floats, away: Floats, left_um: flo
     return demand_um_s + max(missing, 0.0) * away
 
 
-def clearance_and_slope(clearance_um: NDArray[np.float32], point_px: Floats) -> tuple[float, Floats]:
+def clearance_and_slope(clearance_um: Floats32, point_px: Floats) -> tuple[float, Floats]:
     """Clearance at a point (x, y) in px, bilinear, and its gradient (2,) per pixel."""
     row, column, *_, a, b = cell_at(float(point_px[0]), float(point_px[1]), clearance_um.shape)
     (upper_left, upper_right), (lower_left, lower_right) = clearance_um[row : row + 2, column : column + 2].tolist()
@@ -172,7 +172,7 @@ class Controller:
         estimate: Estimate,
         field: FlowField | None,
         robot: Robot,
-        clearance_um: NDArray[np.float32] | None,
+        clearance_um: Floats32 | None,
         um_per_px: float,
         strength: float = 1.0,
         estimate_uses_map: bool = False,

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Estimate, Floats, FlowField, compiled, nearest_pixel
+from flowrec.core import Estimate, Floats, Floats32, FlowField, compiled, nearest_pixel
 from flowrec.physics import MapRaster, raster_velocity, sample
 
 _MOST_DEMANDS = 100  # remembered, whatever delay and frame rate
@@ -77,8 +76,8 @@ def _drift_um(
     delay_s: float,
     more_x: float,
     more_y: float,
-    velocity: NDArray[np.float32],
-    wall_px: NDArray[np.float32],
+    velocity: Floats32,
+    wall_px: Floats32,
     um_per_px: float,
     registration: Floats,
 ) -> tuple[float, float]:

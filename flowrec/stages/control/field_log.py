@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from flowrec.core import NS_PER_S, Applied, Floats, nanoseconds, seconds
+from flowrec.core import NS_PER_S, Applied, Floats, Ints, nanoseconds, seconds
 from flowrec.stages.control.field_rotation import MotionSegment
 
 _COILS = 3  # where no row says otherwise
@@ -74,7 +74,7 @@ class FieldLog:
         return self._rows
 
     @property
-    def times_ns(self) -> NDArray[np.int64]:
+    def times_ns(self) -> Ints:
         """(n,) stamps of the rows."""
         return self._times_ns[: self._rows]
 
@@ -194,7 +194,7 @@ class FieldLog:
         amplitude = np.where(turns > 0.0, np.interp(middle, rows, self.amplitude_mt), self.amplitude_mt[held])
         return type(self)(times, turns, np.arctan2(across, along), amplitude, self.currents_a[held])
 
-    def _rates(self, rows: slice | NDArray[np.int64]) -> Floats:
+    def _rates(self, rows: slice | Ints) -> Floats:
         """(..., 2) revolutions per second along x and y; zero without amplitude."""
         values = self._values[rows]
         frequency = np.where(values[..., _AMPLITUDE] > 0.0, values[..., _FREQUENCY], 0.0)

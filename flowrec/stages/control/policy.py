@@ -13,13 +13,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Floats, cells_at, nearest_pixel
+from flowrec.core import Floats, Floats32, cells_at, nearest_pixel
 from flowrec.stages.control.tracking_laws import Reference, Situation, VectorLaw
 from flowrec.stages.control.trajectory import nearest_time, position_at
 
-Raster = NDArray[np.float32]
 _HEADINGS = 64  # compared first, 5.6 degrees apart; a parabola through the best one refines it
 _STEP_PX = 1.5  # between points that are evaluated on the way, so that no wall is missed
 _ANGLES = np.arange(_HEADINGS) * (2.0 * np.pi / _HEADINGS)
@@ -73,7 +71,7 @@ class Policy(VectorLaw):
 
 
 def steepest_descent(
-    time_to_go_s: Raster, um_per_px: float, point_um: Floats, distance_um: float, drift: Floats | None = None
+    time_to_go_s: Floats32, um_per_px: float, point_um: Floats, distance_um: float, drift: Floats | None = None
 ) -> Floats:
     """Unit vector (2,): the heading for which T is least after the robot has swum a distance from a point.
 
@@ -103,7 +101,7 @@ def steepest_descent(
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def distance_to_known(time_to_go_s: Raster, um_per_px: float, point_um: Floats) -> float:
+def distance_to_known(time_to_go_s: Floats32, um_per_px: float, point_um: Floats) -> float:
     """Distance from a point (2,) to the nearest pixel with a time, 0 up to half a diagonal; inf if no pixel has one."""
     point = point_um / um_per_px
     row, column = nearest_pixel(float(point[0]), float(point[1]), time_to_go_s.shape)
@@ -114,7 +112,7 @@ def distance_to_known(time_to_go_s: Raster, um_per_px: float, point_um: Floats) 
     return max(math.hypot(*(nearest - point)) - math.sqrt(0.5), 0.0) * um_per_px
 
 
-def _towards_known(time_to_go_s: Raster, point: Floats) -> Floats:
+def _towards_known(time_to_go_s: Floats32, point: Floats) -> Floats:
     """Unit vector from a point (px) to the nearest pixel with a time; zero if there is none, or the robot is on it."""
     nearest = _nearest_known(time_to_go_s, point)
     difference = np.zeros(2) if nearest is None else nearest - point
@@ -122,7 +120,7 @@ def _towards_known(time_to_go_s: Raster, point: Floats) -> Floats:
     return np.asarray(difference / length) if length > 0.0 else np.zeros(2)
 
 
-def _nearest_known(time_to_go_s: Raster, point: Floats) -> Floats | None:
+def _nearest_known(time_to_go_s: Floats32, point: Floats) -> Floats | None:
     """(2,) px, the nearest pixel with a time: searched nearby first, then everywhere."""
     h, w = time_to_go_s.shape
     x, y = min(max(float(point[0]), 0.0), w - 1.0), min(max(float(point[1]), 0.0), h - 1.0)

@@ -17,15 +17,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Floats, FlowField, compiled
+from flowrec.core import Floats, Floats32, FlowField, compiled
 from flowrec.physics import MapRaster, raster_velocity
 
 ISOTROPIC = np.array([0.5, 1.0, 1.0])  # relative variances of [sxx, sxy, syx] that do not depend on the axes
 _XX, _XY, _YX = ISOTROPIC.tolist()
-
-Raster = NDArray[np.float32]
 
 
 class StateLayout(NamedTuple):
@@ -70,8 +67,8 @@ def _propagate(
     turns: Floats,
     um_per_rev: float,
     dt: float,
-    velocity: Raster,
-    wall_px: Raster,
+    velocity: Floats32,
+    wall_px: Floats32,
     um_per_px: float,
     registration: Floats,
 ) -> tuple[Floats, Floats]:
@@ -156,7 +153,7 @@ def advance_covariance(
 
 @compiled
 def _gradient(
-    velocity: Raster, wall_px: Raster, um_per_px: float, registration: Floats, x_um: float, y_um: float
+    velocity: Floats32, wall_px: Floats32, um_per_px: float, registration: Floats, x_um: float, y_um: float
 ) -> tuple[float, float, float, float]:
     half = 0.5 * um_per_px
     ax, ay = raster_velocity(velocity, wall_px, um_per_px, registration, x_um + half, y_um)

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Estimate, Floats, Method, Methods, Observations, Range, Share, nanoseconds, seconds
+from flowrec.core import Bools, Estimate, Floats, Method, Methods, Observations, Range, Share, nanoseconds, seconds
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import lag_s, memory_s
 
@@ -161,7 +160,7 @@ class Sampler:
         return one if previous is None else previous.only(slice(-self.capacity + 1, None)).followed_by(one)
 
 
-def _central(values: Floats, discarded: float) -> NDArray[np.bool_]:
+def _central(values: Floats, discarded: float) -> Bools:
     """True where a value is neither among the largest nor the smallest; `discarded` is the fraction of either."""
     rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
     count = int(discarded * len(values))

@@ -16,9 +16,8 @@ import numpy as np
 import scipy  # its optimize loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.core import compiled
+from flowrec.core import Floats, compiled
 
-Floats = NDArray[np.float64]
 Flags = NDArray[np.int8]
 
 USED, SKIPPED, RESTART = 0, 1, 2  # of a frame: measured, not to be trusted, first frame of another stretch

@@ -9,14 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Floats, compiled
+from flowrec.core import Bools, Floats, compiled
 
-Ints = NDArray[np.int64]
 Points = Floats  # (n, 2), or (2,) of one
 Raster = Floats  # (h, w)
-Mask = NDArray[np.bool_]  # (h, w)
+Mask = Bools  # (h, w)
 # The 8 neighbours of a pixel, by the angle; the opposite of number k is number k + 4.
 NEIGHBOUR_X = np.array([1, 1, 0, -1, -1, -1, 0, 1], np.int64)
 NEIGHBOUR_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.core import Floats, Route, bilinear, compiled
-from flowrec.stages.planning.cost_rasters import CostRasters, Ints, Raster
+from flowrec.core import Floats, Ints, Route, bilinear, compiled
+from flowrec.stages.planning.cost_rasters import CostRasters, Raster
 from flowrec.stages.planning.free_space import FreeSpace
 from flowrec.stages.planning.kernels import line_is_clear, step_time
 from flowrec.stages.planning.path_refinement import refined_route

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from flowrec.core import Floats, Route, bilinear, compiled
-from flowrec.stages.planning.cost_rasters import CostRasters, Ints, Points, Raster
+from flowrec.core import Floats, Ints, Route, bilinear, compiled
+from flowrec.stages.planning.cost_rasters import CostRasters, Points, Raster
 from flowrec.stages.planning.kernels import lowest_clearance, segment_cost
 from flowrec.stages.planning.problem import Problem
 from flowrec.stages.planning.route import subdivide

@@ -20,9 +20,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Floats, FlowField, Observations, Route, nearest_pixels
+from flowrec.core import Floats, FlowField, Ints, Observations, Route, nearest_pixels
 from flowrec.physics import Chip, FlowUncertainty, Robot
 
 
@@ -129,7 +128,7 @@ class Looks:
     chip: Chip
     patch_px: float  # side of a patch
     share: float  # of the speed of the flow, one standard deviation of the error that looks at a patch share
-    pixel: NDArray[np.intp]  # (h, w) index of each fluid pixel among those of the uncertainty
+    pixel: Ints  # (h, w) index of each fluid pixel among those of the uncertainty
     sums: Floats  # (patches, 2, q + k) sum of w A so far
     weights: Floats  # (patches,) sum of w so far
 
@@ -172,13 +171,13 @@ class Looks:
         ]
         return np.asarray(scaled.T @ scaled - shared[0].T @ shared[0] + shared[1].T @ shared[1])
 
-    def _after(self, which: NDArray[np.intp], weight: Floats, effect: Floats) -> Looks:
+    def _after(self, which: Ints, weight: Floats, effect: Floats) -> Looks:
         sums, weights = self.sums.copy(), self.weights.copy()
         np.add.at(sums, which, effect * weight[:, None, None])
         np.add.at(weights, which, weight)
         return replace(self, sums=sums, weights=weights)
 
-    def _on_way(self, waypoints_um: Floats, arrival_s: Floats) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
+    def _on_way(self, waypoints_um: Floats, arrival_s: Floats) -> tuple[Ints, Floats, Floats, Floats]:
         legs, duration = np.diff(waypoints_um, axis=0), np.maximum(np.diff(arrival_s), 1e-9)
         middle = 0.5 * (waypoints_um[1:] + waypoints_um[:-1])
         sampling = self.sampling
@@ -188,7 +187,7 @@ class Looks:
 
     def _looks(
         self, places_um: Floats, velocity_um_s: Floats, count: Floats, over_ground: bool = False
-    ) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
+    ) -> tuple[Ints, Floats, Floats, Floats]:
         """Patch (m,), weight (m,), effect (m, 2, q + k) and shared error (m,) of the looks in fluid."""
         shape, mean = self.chip.mask.shape, self.uncertainty.mean_um_s
         rows, columns = nearest_pixels(places_um.reshape(-1, 2) / self.chip.um_per_px, shape)

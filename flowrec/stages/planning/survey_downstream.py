@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.core import Floats, Route
-from flowrec.stages.planning.cost_rasters import Ints, Mask
+from flowrec.core import Floats, Ints, Route
+from flowrec.stages.planning.cost_rasters import Mask
 from flowrec.stages.planning.free_space import FreeSpace
 from flowrec.stages.planning.grid_search import backtrack
 from flowrec.stages.planning.problem import attach_start

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 
-from flowrec.core import Floats, FlowField, Route
+from flowrec.core import Floats, FlowField, Ints, Route
 from flowrec.physics import Chip, distance_px
-from flowrec.stages.planning.cost_rasters import Ints, Mask, Points, Raster
+from flowrec.stages.planning.cost_rasters import Mask, Points, Raster
 from flowrec.stages.planning.free_space import FastFlowMargin, FreeSpace, spaces_by_margin
 from flowrec.stages.planning.grid_search import TRAVEL_TIME, directions, search
 from flowrec.stages.planning.path_refinement import refine_path

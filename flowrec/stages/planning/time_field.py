@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.core import Floats, Route, bilinear, compiled
+from flowrec.core import Floats, Ints, Route, bilinear, compiled
 from flowrec.physics import RESERVE
-from flowrec.stages.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, Ints, Mask, Raster, interpolate_raster
+from flowrec.stages.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, Mask, Raster, interpolate_raster
 from flowrec.stages.planning.eikonal import descend, time_field
 from flowrec.stages.planning.grid_search import TRAVEL_TIME, directions, shortest_path, too_fast_route
 from flowrec.stages.planning.path_refinement import SPACING_PX, refined_route

@@ -13,9 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Image, compiled
+from flowrec.core import Floats, Floats32, Image, compiled
 
 RIM_RATIO = 0.35  # brightness of the rim relative to the disc's darkness, where nothing better is known
 STEEPNESS = 2.2  # of the outline
@@ -45,8 +44,8 @@ def initial_edge_px(radius_px: float) -> float:
 
 @compiled
 def fit_disc(
-    image: Image | NDArray[np.float32],
-    distance_px: NDArray[np.float32],
+    image: Image | Floats32,
+    distance_px: Floats32,
     margin_px: float,
     x: float,
     y: float,
@@ -119,14 +118,14 @@ def fit_radius(radius_px: float, edge_px: float) -> float:
 
 @compiled
 def block_means(
-    image: Image | NDArray[np.float32],
-    distance_px: NDArray[np.float32],
+    image: Image | Floats32,
+    distance_px: Floats32,
     margin_px: float,
     x: float,
     y: float,
     limit: float,
     step: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats, Floats]:
     """Offsets in x and y from (x, y), and mean grey level, of each block without wall within the limit, each (n,)."""
     height, width = image.shape
     x0, x1 = max(math.floor(x - limit), 0), min(math.ceil(x + limit) + 1, width)
@@ -152,9 +151,7 @@ def block_means(
 
 
 @compiled
-def _initial(
-    across: NDArray[np.float64], down: NDArray[np.float64], grey: NDArray[np.float64], radius_px: float, edge_px: float
-) -> NDArray[np.float64]:
+def _initial(across: Floats, down: Floats, grey: Floats, radius_px: float, edge_px: float) -> Floats:
     """Initial parameters (9,): the darkness is the difference between the outermost part and the middle."""
     inner, inner_count, outer, outer_count = 0.0, 1e-9, 0.0, 1e-9
     for n in range(len(grey)):
@@ -175,13 +172,13 @@ def _initial(
 
 @compiled
 def _equations(
-    across: NDArray[np.float64],
-    down: NDArray[np.float64],
-    grey: NDArray[np.float64],
-    trial: NDArray[np.float64],
+    across: Floats,
+    down: Floats,
+    grey: Floats,
+    trial: Floats,
     scale2: float,
-    normal: NDArray[np.float64],
-    slope: NDArray[np.float64],
+    normal: Floats,
+    slope: Floats,
 ) -> tuple[float, float, float]:
     """Fill the normal equations at `trial`; return the cost, the robust variance of the residuals and the likeness."""
     for k in range(_PARAMETERS):
@@ -229,9 +226,7 @@ def _equations(
 
 
 @compiled
-def _prior(
-    normal: NDArray[np.float64], slope: NDArray[np.float64], which: int, miss: float, sigma: float, unit: float
-) -> float:
+def _prior(normal: Floats, slope: Floats, which: int, miss: float, sigma: float, unit: float) -> float:
     """Add a normal prior to one parameter; return its cost."""
     normal[which, which] += unit / (sigma * sigma)
     slope[which] += unit * miss / (sigma * sigma)
@@ -239,7 +234,7 @@ def _prior(
 
 
 @compiled
-def _solve(normal: NDArray[np.float64], right: NDArray[np.float64], damping: float) -> None:
+def _solve(normal: Floats, right: Floats, damping: float) -> None:
     """Solve the damped normal equations in place, by the Cholesky factor in the lower triangle."""
     for a in range(_PARAMETERS):
         normal[a, a] = normal[a, a] * (1.0 + damping) + 1e-9

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Image, nearest_pixel
+from flowrec.core import Floats32, Image, nearest_pixel
 from flowrec.stages.vision.disc_fit import fit_disc, fit_radius, initial_edge_px
 from flowrec.stages.vision.masked_ncc import masked_ncc, template
 from flowrec.stages.vision.walls import Box, Walls
@@ -54,7 +53,7 @@ class DiscSearch:
     slack_px: float = 0.0  # the walls may be off by this much
 
 
-def best_disc(image: Image | NDArray[np.float32], walls: Walls, search: DiscSearch) -> Disc | None:
+def best_disc(image: Image | Floats32, walls: Walls, search: DiscSearch) -> Disc | None:
     """The best disc within the search range."""
     near = math.isfinite(search.range_px)
     best, best_rank = None, 0.0
@@ -70,7 +69,7 @@ def best_disc(image: Image | NDArray[np.float32], walls: Walls, search: DiscSear
     return best
 
 
-def discs(image: Image | NDArray[np.float32], walls: Walls, search: DiscSearch) -> Iterator[Disc]:
+def discs(image: Image | Floats32, walls: Walls, search: DiscSearch) -> Iterator[Disc]:
     """The discs within the search range that are like a robot, the most similar ones to its template first."""
     x0, y0, x1, y1 = search.box
     if x1 <= x0 or y1 <= y0:
@@ -98,7 +97,7 @@ def discs(image: Image | NDArray[np.float32], walls: Walls, search: DiscSearch) 
             yield found
 
 
-def _measure(image: Image | NDArray[np.float32], walls: Walls, x: float, y: float, search: DiscSearch) -> Disc | None:
+def _measure(image: Image | Floats32, walls: Walls, x: float, y: float, search: DiscSearch) -> Disc | None:
     """Fit a disc near a candidate; None if the result can not be the robot."""
     expected = search.expected_px
     step = max(1, int(search.nominal_px / _FINE_RADIUS_PX))
@@ -114,7 +113,7 @@ def _measure(image: Image | NDArray[np.float32], walls: Walls, x: float, y: floa
 
 
 def best_disc_normalised(
-    image: Image | NDArray[np.float32], walls: Walls, search: DiscSearch, noise: float, slack_px: float
+    image: Image | Floats32, walls: Walls, search: DiscSearch, noise: float, slack_px: float
 ) -> Disc | None:
     """The best disc in an image scaled so that the noise of a pixel is 2 grey levels.
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Image, compiled
+from flowrec.core import Floats, Floats32, Image, compiled
 
 WINDOW = 2.0  # half width of the background's window in radii
 _NOISE_FLOOR = 2.0  # standard deviations of c below which a pixel is background
@@ -20,7 +19,7 @@ _NOISE_FLOOR = 2.0  # standard deviations of c below which a pixel is background
 @compiled
 def reduced_foreground(
     image: Image,
-    distance_px: NDArray[np.float32],
+    distance_px: Floats32,
     x0: int,
     y0: int,
     columns: int,
@@ -28,7 +27,7 @@ def reduced_foreground(
     step: int,
     half: int,
     solid_px: float,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Foreground c (rows, columns) in grey levels, of blocks of step x step pixels from (x0, y0) on.
 
     `half` is the half width of the background's window in blocks. Blocks whose distance to the walls is below
@@ -69,14 +68,14 @@ def reduced_foreground(
 @compiled
 def _block_means(
     image: Image,
-    distance_px: NDArray[np.float32],
+    distance_px: Floats32,
     x0: int,
     y0: int,
     columns: int,
     rows: int,
     step: int,
     solid_px: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Floats32, Floats32]:
     """Mean grey levels (rows, columns) of blocks of step x step pixels from (x0, y0) on, and 1 where a block counts.
 
     Both are 0 in a block whose distance to the walls is below `solid_px`.
@@ -107,7 +106,7 @@ def _block_means(
 
 
 @compiled
-def energy_map(c: NDArray[np.float32], noise: float, sign: int, half: int) -> NDArray[np.float32]:
+def energy_map(c: Floats32, noise: float, sign: int, half: int) -> Floats32:
     """Mean of the squared foreground, in units of its noise, over (2 half + 1)^2 blocks, taken twice.
 
     sign: 1 bright parts only, -1 dark parts only, 0 both.
@@ -126,7 +125,7 @@ def energy_map(c: NDArray[np.float32], noise: float, sign: int, half: int) -> ND
 
 
 @compiled
-def _box_mean(values: NDArray[np.float32], half: int) -> NDArray[np.float32]:
+def _box_mean(values: Floats32, half: int) -> Floats32:
     rows, columns = values.shape
     across = np.empty((rows, columns), np.float32)
     scale = 1.0 / (2 * half + 1)
@@ -155,7 +154,7 @@ def _box_mean(values: NDArray[np.float32], half: int) -> NDArray[np.float32]:
 
 
 @compiled
-def peaks(values: NDArray[np.float32], least: float, apart: int, most: int) -> NDArray[np.float64]:
+def peaks(values: Floats32, least: float, apart: int, most: int) -> Floats:
     """Local maxima (n, 3) of a map: column, row, value; the greatest first, at most `most`, `apart` blocks apart."""
     rows, columns = values.shape
     found = np.empty((most, 3))
@@ -188,7 +187,7 @@ def peaks(values: NDArray[np.float32], least: float, apart: int, most: int) -> N
 
 @compiled
 def silhouette_centroid(
-    c: NDArray[np.float32], noise: float, sign: int, x: float, y: float, radius: float, moves: int
+    c: Floats32, noise: float, sign: int, x: float, y: float, radius: float, moves: int
 ) -> tuple[float, float, float, float]:
     """Centroid of the foreground within a radius, in blocks: x, y, energy and the level that halves a weight.
 
@@ -243,7 +242,7 @@ def silhouette_centroid(
 
 
 @compiled
-def patch_at(c: NDArray[np.float32], x: float, y: float, half: int) -> NDArray[np.float32]:
+def patch_at(c: Floats32, x: float, y: float, half: int) -> Floats32:
     """Bilinear samples (2 half + 1, 2 half + 1) of a map around a point; 0 outside."""
     rows, columns = c.shape
     size = 2 * half + 1
@@ -266,7 +265,7 @@ def patch_at(c: NDArray[np.float32], x: float, y: float, half: int) -> NDArray[n
 
 @compiled
 def most_similar(
-    c: NDArray[np.float32], x: float, y: float, views: NDArray[np.float32], window: NDArray[np.float32], reach: int
+    c: Floats32, x: float, y: float, views: Floats32, window: Floats32, reach: int
 ) -> tuple[int, float, int, int]:
     """The view (n, s, s) most similar to the map near a point: its number, weighted correlation, offset in x and y."""
     rows, columns = c.shape
@@ -307,7 +306,7 @@ def most_similar(
 
 @compiled
 def register_view(
-    c: NDArray[np.float32], x: float, y: float, view: NDArray[np.float32], window: NDArray[np.float32], limit: float
+    c: Floats32, x: float, y: float, view: Floats32, window: Floats32, limit: float
 ) -> tuple[float, float, float]:
     """Position at which a view fits the map best, by Gauss-Newton for shift, gain and offset; and its correlation.
 
@@ -348,9 +347,7 @@ def register_view(
 
 
 @compiled
-def _moments(
-    patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]
-) -> tuple[float, float, float, float, float, float]:
+def _moments(patch: Floats32, view: Floats32, window: Floats32) -> tuple[float, float, float, float, float, float]:
     """Weighted sums of 1, patch, view, patch^2, view^2 and patch view."""
     sw, si, st, sii, stt, sit = 1e-12, 0.0, 0.0, 0.0, 0.0, 0.0
     for v in range(patch.shape[0]):
@@ -366,7 +363,7 @@ def _moments(
 
 
 @compiled
-def _gain(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> tuple[float, float]:
+def _gain(patch: Floats32, view: Floats32, window: Floats32) -> tuple[float, float]:
     """Weighted least-squares gain and offset: patch = gain view + offset."""
     sw, si, st, _, stt, sit = _moments(patch, view, window)
     gain = (sit - si * st / sw) / max(stt - st * st / sw, 1e-12)
@@ -374,7 +371,7 @@ def _gain(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray
 
 
 @compiled
-def correlation(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> float:
+def correlation(patch: Floats32, view: Floats32, window: Floats32) -> float:
     """Weighted correlation of two views."""
     sw, si, st, sii, stt, sit = _moments(patch, view, window)
     spread = (sii - si * si / sw) * (stt - st * st / sw)

@@ -23,9 +23,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Appearance, Floats, Image, Track
+from flowrec.core import Appearance, Floats, Floats32, Image, Ints, Track
 from flowrec.stages.vision.foreground import (
     WINDOW,
     correlation,
@@ -101,7 +100,7 @@ class ReducedScale:
         """Largest margin around a searched box within which pixels are read."""
         return self.margin_px + self.step * (self.background + 3)
 
-    def window(self) -> NDArray[np.float32]:
+    def window(self) -> Floats32:
         """Weights (n, n) of a view's pixels: 1 within the radius, 0 from 1.5 radii on."""
         return _window(self.radius)
 
@@ -112,7 +111,7 @@ def scale_of(radius_px: float) -> ReducedScale:
 
 
 @lru_cache(maxsize=16)
-def _window(radius: float) -> NDArray[np.float32]:
+def _window(radius: float) -> Floats32:
     half = math.ceil(1.5 * radius)
     axis = np.arange(-half, half + 1)
     rho = np.hypot(axis[None], axis[:, None])
@@ -125,7 +124,7 @@ def _window(radius: float) -> NDArray[np.float32]:
 class ForegroundRegion:
     """The foreground of a part of an image, in blocks; block (0, 0) is centred at `x0`, `y0` in camera px."""
 
-    c: NDArray[np.float32]
+    c: Floats32
     x0: float
     y0: float
     scale: ReducedScale
@@ -180,7 +179,7 @@ class Candidates:
     blocks: Floats
     px: Floats
     energy: Floats
-    view: NDArray[np.intp]
+    view: Ints
     similarity: Floats
     start: Floats
 
@@ -356,7 +355,7 @@ def locate_robot(
     return weight * registration + (1.0 - weight) * centroid, max(similarity, correlated)
 
 
-def centroid_of(view: NDArray[np.float32], appearance: Appearance, moves: int) -> tuple[float, float, float, float]:
+def centroid_of(view: Floats32, appearance: Appearance, moves: int) -> tuple[float, float, float, float]:
     """The `silhouette_centroid` of a view, which follows it from the middle of the view on."""
     middle, radius = float(view.shape[0] // 2), ReducedScale(appearance.radius_px).radius
     sign, noise = SIGNS[appearance.polarity], appearance.foreground_noise

@@ -12,16 +12,15 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Image, compiled
+from flowrec.core import Bools, Floats32, Image, compiled
 from flowrec.stages.vision.disc_fit import RIM_RATIO, initial_edge_px, profile
 
 _LEAST_OVERLAP = 0.5  # fraction of the template that must lie on pixels that count
 
 
 @lru_cache(maxsize=16)
-def template(radius_px: float, step: int) -> NDArray[np.float32]:
+def template(radius_px: float, step: int) -> Floats32:
     """The robot (n, n), n odd, in an image reduced by `step`: disc -1, rim positive, background 0; mean subtracted."""
     radius, edge = radius_px / step, initial_edge_px(radius_px) / step + 0.3 * (step > 1)
     half = math.ceil(1.15 * radius + 2.5 * edge)
@@ -40,14 +39,14 @@ def template(radius_px: float, step: int) -> NDArray[np.float32]:
 
 @compiled
 def masked_ncc(
-    image: Image | NDArray[np.float32],
-    distance_px: NDArray[np.float32],
+    image: Image | Floats32,
+    distance_px: Floats32,
     box: tuple[int, int, int, int],
     step: int,
     margin_px: float,
     clearance_px: float,
-    pattern: NDArray[np.float32],
-) -> NDArray[np.float32]:
+    pattern: Floats32,
+) -> Floats32:
     """Correlation -1 to 1 (rows, columns) with the robot centred on each block of step x step pixels of a box.
 
     Pixels nearer to a wall than the margin do not count, nor do those outside the image. Blocks nearer to a wall than
@@ -108,15 +107,15 @@ def masked_ncc(
 
 @compiled
 def _weighted_blocks(
-    image: Image | NDArray[np.float32],
-    distance_px: NDArray[np.float32],
+    image: Image | Floats32,
+    distance_px: Floats32,
     x0: int,
     y0: int,
     columns: int,
     rows: int,
     step: int,
     margin_px: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[Floats32, Floats32, Floats32, Bools]:
     """M I, M I^2 and M (rows, columns) of blocks of step x step pixels from (x0, y0) on; rows in which all M are 1.
 
     I is in grey levels minus 128. M is the fraction of a block that counts: 0 outside the image.
@@ -145,7 +144,7 @@ def _weighted_blocks(
 
 
 @compiled
-def _window_sums(values: NDArray[np.float32], row: int, first: int, span: int, size: int) -> NDArray[np.float32]:
+def _window_sums(values: Floats32, row: int, first: int, span: int, size: int) -> Floats32:
     """Sums (span,) over windows of size x size from (row, first) on: along the columns first, then along the row."""
     one = np.float32(1.0)
     line = np.zeros(span + size - 1, np.float32)
@@ -158,7 +157,7 @@ def _window_sums(values: NDArray[np.float32], row: int, first: int, span: int, s
 
 
 @compiled
-def _add(to: NDArray[np.float32], factor: np.float32, what: NDArray[np.float32]) -> None:
+def _add(to: Floats32, factor: np.float32, what: Floats32) -> None:
     """Add a multiple of the first part of an array to another, in a loop that is vectorised."""
     for i in range(len(to)):
         to[i] += factor * what[i]

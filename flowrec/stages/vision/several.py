@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, Frame, Track, seconds
+from flowrec.core import Bools, Floats, Frame, Ints, Track, seconds
 from flowrec.physics import Calibration, Robot
 from flowrec.stages.vision.disc_search import LARGEST, Disc, DiscSearch, discs
 from flowrec.stages.vision.joint_fit import Body, fit_jointly
@@ -174,7 +174,7 @@ def _apart(found: list[Disc], radius_px: float) -> list[Disc]:
     return kept
 
 
-def _groups(touching: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+def _groups(touching: Bools) -> list[Ints]:
     """The groups of two or more that touch, directly or through others."""
     from scipy.sparse.csgraph import connected_components  # not at start-up
 

@@ -18,9 +18,21 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import NS_PER_S, STD_PER_MAD, TUKEY, Background, Floats, Frame, Image, Range, Shift, Track
+from flowrec.core import (
+    NS_PER_S,
+    STD_PER_MAD,
+    TUKEY,
+    Background,
+    Bools,
+    Floats,
+    Frame,
+    Image,
+    Ints,
+    Range,
+    Shift,
+    Track,
+)
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.learning import pixel_noise
 from flowrec.stages.vision.walls import walls_in_view
@@ -187,13 +199,13 @@ def _fit(image: Image, pixels: Floats, noise: float, start_px: Floats, direction
     return _Fit(shift_px, std_px, alike)
 
 
-def _tiles_of(pixels: Floats) -> NDArray[np.intp]:
+def _tiles_of(pixels: Floats) -> Ints:
     """The number of the tile (n,) in which each pixel lies, counted without gaps."""
     tile = (pixels[:, 1] // _TILE_PX) * 1e4 + pixels[:, 0] // _TILE_PX
     return np.unique(tile, return_inverse=True)[1]
 
 
-def _standard_error(pulls: Floats, tiles: NDArray[np.intp], curvature: Floats) -> float:
+def _standard_error(pulls: Floats, tiles: Ints, curvature: Floats) -> float:
     """Standard error of a shift (m,) in its least certain direction, from the pull of each tile.
 
     H^-1 (sum_t u_t u_t^T) H^-1 with the sum u_t of the pulls (n, m) of a tile (Liang and Zeger 1986): the pixels of a
@@ -223,7 +235,7 @@ def _search_shift(image: Image, pixels: Floats, reach_px: float, directions: Flo
     return best
 
 
-def _levels(image: Image, places_px: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _levels(image: Image, places_px: Floats) -> tuple[Floats, Bools]:
     """Grey levels (n,) between pixels, by bilinear interpolation, and which places (n, 2) lie in the image."""
     height, width = image.shape
     x, y = places_px.T

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.core import Floats, Frame, Range, Tracers, Track, seconds
+from flowrec.core import Bools, Floats, Frame, Ints, Range, Tracers, Track, seconds
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.spots import SpotSearch
 from flowrec.stages.vision.walls import Walls, walls_in_view
@@ -52,7 +51,7 @@ class _Bodies(NamedTuple):
     from_um: Floats
     from_s: Floats
 
-    def only(self, which: NDArray[np.bool_]) -> _Bodies:
+    def only(self, which: Bools) -> _Bodies:
         return _Bodies(*(column[which] for column in self))
 
 
@@ -133,9 +132,7 @@ class TracerTracker:
         )
 
 
-def assign(
-    expected: Floats, variance: Floats, spots: Floats, unlike: Floats | None = None
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def assign(expected: Floats, variance: Floats, spots: Floats, unlike: Floats | None = None) -> tuple[Ints, Ints]:
     """The assignment of spots to bodies: indices (k,) of bodies expected at (n, 2), and of their spots (m, 2).
 
     `variance` (n,) is that of the distance per component, `unlike` (n, m) what the look of a spot adds to the cost.
@@ -203,7 +200,7 @@ def _predict(previous: Tracers, dt: float, robot: Robot, diffusion_um2_s: float)
     )
 
 
-def _correct(bodies: _Bodies, rows: NDArray[np.intp], spots_um: Floats, std_um: float) -> _Bodies:
+def _correct(bodies: _Bodies, rows: Ints, spots_um: Floats, std_um: float) -> _Bodies:
     """The bodies after those of `rows` were seen at spots (k, 2)."""
     position, velocity, shared = bodies.std_um**2, bodies.velocity_std_um_s**2, bodies.shared_um2_s.copy()
     place, speed = bodies.position_um.copy(), bodies.velocity_um_s.copy()
@@ -248,7 +245,7 @@ def _new_bodies(spots_um: Floats, first: int, entered: Floats, std_um: float, ro
     )
 
 
-def _in_view(points_um: Floats, walls: Walls, calibration: Calibration) -> NDArray[np.bool_]:
+def _in_view(points_um: Floats, walls: Walls, calibration: Calibration) -> Bools:
     """(n,) which points lie in the image and in the fluid that it shows, by a pixel."""
     px = np.rint(calibration.to_px(points_um).reshape(-1, 2))
     x0, y0, x1, y1 = walls.box
@@ -259,7 +256,7 @@ def _in_view(points_um: Floats, walls: Walls, calibration: Calibration) -> NDArr
 
 def _near_edge(
     points_um: Floats, margin_um: float, chip: Chip, calibration: Calibration, shape: tuple[int, ...]
-) -> NDArray[np.bool_]:
+) -> Bools:
     """(n,) which points are near the edge of the image or of the chip, where bodies come in."""
     size_um, margin_px = np.array(chip.size_um), margin_um / calibration.um_per_px
     px = calibration.to_px(points_um).reshape(-1, 2)

@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowrec.core import Bools, Floats32
 from flowrec.physics import Calibration, Chip
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 in camera px, the latter two exclusive
@@ -19,7 +19,7 @@ _FAR_PX = 1e4  # distance to the walls of a chip without walls
 class Walls:
     """Distance to the walls in the camera's image, and the bounding box of the fluid."""
 
-    distance_px: NDArray[np.float32]  # (h, w), negative in solid
+    distance_px: Floats32  # (h, w), negative in solid
     box: Box
 
     def for_shift(self, shift_px: tuple[float, float]) -> Walls:
@@ -55,7 +55,7 @@ def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, ...]) 
     return Walls(np.ascontiguousarray(distance, np.float32), box)
 
 
-def _mask_distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _mask_distance_px(mask: Bools) -> Floats32:
     """Signed distance (h, w) to the walls of a mask in its pixels, as `clearance_um` defines it.
 
     It differs from `clearance_um` in the last bits: it is not rounded, and far from any wall it is finite. The two are
