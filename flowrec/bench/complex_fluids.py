@@ -10,12 +10,24 @@ import numpy as np
 from scipy.integrate import cumulative_simpson
 from scipy.optimize import brentq
 
+from flowrec.bench.exact_flows import (
+    INNER_PX,
+    MARGIN_PX,
+    OUTER_PX,
+    SPEED_UM_S,
+    UM_PER_PX,
+    bend,
+    bend_distance,
+    bend_slope,
+    oblique_channel,
+    relative_percent,
+    straight_channel,
+)
 from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, Floats
 from flowrec.physics import (
     CarreauYasuda,
     Chip,
     FlowSolver,
-    Opening,
     PowerLaw,
     Scales,
     ViscosityLaw,
@@ -32,7 +44,6 @@ LAWS: dict[str, ViscosityLaw] = {
     "carreau 0.3": CarreauYasuda(0.3, 0.2),
     "blood": blood(),
 }
-_UM_PER_PX, _SPEED_UM_S, _MARGIN_PX = 10.0, 100.0, 2
 _ACROSS, _RATES = 4_001, 20_001  # of the quadrature
 
 
@@ -41,8 +52,7 @@ def channel_profile(law: ViscosityLaw, half_m: float, mean_m_s: float, from_midd
 
     The stress grows linearly from the middle, and the shear rate is the inverse of the flow curve.
     """
-    rates = np.concatenate([[0.0], np.logspace(-8, 8, _RATES - 1)])
-    stresses = rates * law.relative(rates**2)[0]
+    rates, stresses = _flow_curve(law)
     places = np.linspace(0.0, half_m, _ACROSS)
 
     def speeds(wall: float) -> Floats:
@@ -56,28 +66,29 @@ def channel_profile(law: ViscosityLaw, half_m: float, mean_m_s: float, from_midd
     return np.interp(np.abs(from_middle_m), places, speeds(wall)), wall
 
 
+def _flow_curve(law: ViscosityLaw) -> tuple[Floats, Floats]:
+    """Shear rates (n,) in 1/s, and the stresses over the viscosity of the chip."""
+    rates = np.concatenate([[0.0], np.logspace(-8, 8, _RATES - 1)])
+    return rates, rates * law.relative(rates**2)[0]
+
+
 def law_channel_case(name: str, width_px: int, k: int) -> dict[str, Any]:
     """Errors of the profile (relative L2 norm at pixel centres) and of the pressure gradient, along the pixels."""
     length = 5 * width_px
-    mask = np.zeros((width_px + 2 * _MARGIN_PX, length), bool)
-    mask[_MARGIN_PX:-_MARGIN_PX] = True
-    ends = (_MARGIN_PX, _MARGIN_PX + width_px - 1)
-    openings = (Opening("left", *ends, "inlet", _SPEED_UM_S), Opening("right", *ends, "outlet", 0.0))
-    chip = Chip("channel", mask, _UM_PER_PX, openings, 1.0, 1000.0, walls="pixel", law=LAWS[name])
-    field = FlowSolver(k).solve(chip)
-    px = _UM_PER_PX * M_PER_UM
+    field = FlowSolver(k).solve(straight_channel(width_px, length, LAWS[name]))
+    px = UM_PER_PX * M_PER_UM
     across = np.asarray((np.arange(width_px) - 0.5 * (width_px - 1)) * px, np.float64)
     half = 0.5 * width_px * px
-    exact, wall = channel_profile(LAWS[name], half, _SPEED_UM_S * M_PER_UM, across)
+    exact, wall = channel_profile(LAWS[name], half, SPEED_UM_S * M_PER_UM, across)
     # Downstream, where the profile of the inlet is forgotten.
     at = length - width_px
-    found = field.velocity_um_s[_MARGIN_PX:-_MARGIN_PX, at, 0] * M_PER_UM
-    fall = (field.pressure_pa[:, at - 3] - field.pressure_pa[:, at + 3])[_MARGIN_PX:-_MARGIN_PX].mean() / (6.0 * px)
+    found = field.velocity_um_s[MARGIN_PX:-MARGIN_PX, at, 0] * M_PER_UM
+    fall = (field.pressure_pa[:, at - 3] - field.pressure_pa[:, at + 3])[MARGIN_PX:-MARGIN_PX].mean() / (6.0 * px)
     return {
         "law": name,
         "width_px": width_px,
         "k": k,
-        "profile_error_percent": 100.0 * float(np.linalg.norm(found - exact) / np.linalg.norm(exact)),
+        "profile_error_percent": relative_percent(found, exact),
         "resistance_error_percent": 100.0 * (float(fall) * half / (PA_S_PER_MPA_S * wall) - 1.0),
     }
 
@@ -96,31 +107,18 @@ def law_oblique_case(name: str, width_px: float, k: int, angles_deg: tuple[float
 
 def _oblique(law: ViscosityLaw, width_px: float, angle_deg: float, k: int) -> float:
     """Relative error of the velocity in the middle of the channel, percent."""
-    angle, length = np.radians(angle_deg), 80
-    rows = int(length * np.tan(angle)) + 24
-    # Not symmetric to the pixels.
-    middle_x, middle_y = 0.5 * (length - 1) - 0.13, 0.5 * (rows - 1) - 0.27
-
-    def across(x: Floats, y: Floats) -> Floats:
-        return np.asarray((y - middle_y) * np.cos(angle) - (x - middle_x) * np.sin(angle))
-
-    y, x = np.mgrid[:rows, :length].astype(float)
-    mask = np.abs(across(x, y)) < 0.5 * width_px
-    left, right = np.flatnonzero(mask[:, 0]), np.flatnonzero(mask[:, -1])
-    openings = (
-        Opening("left", int(left[0]), int(left[-1]), "inlet", _SPEED_UM_S * width_px / len(left)),
-        Opening("right", int(right[0]), int(right[-1]), "outlet", 0.0),
-    )
-    chip = Chip("oblique", mask, _UM_PER_PX, openings, 1.0, 1000.0, law=law)
-    walls = from_distance(lambda x, y: 0.5 * width_px - np.abs(across(x, y)), mask.shape, k)
+    chip, turned = oblique_channel(width_px, angle_deg, law=law)
+    mask, angle = chip.mask, np.radians(angle_deg)
+    walls = from_distance(lambda x, y: 0.5 * width_px - np.abs(turned(x, y)[0]), mask.shape, k)
     equations = generalised_equations(chip, law, k, walls)
     flux = equations.steady(Scales.of(chip, k, False).drive, 0.0, 100, 1e-9)
-    along = (x - middle_x) * np.cos(angle) + (y - middle_y) * np.sin(angle)
+    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(float)
+    across, along = turned(x, y)
     core = np.abs(along)[mask] < 15.0
-    px = _UM_PER_PX * M_PER_UM
-    speed, _ = channel_profile(law, 0.5 * width_px * px, _SPEED_UM_S * M_PER_UM, across(x, y)[mask][core] * px)
+    px = UM_PER_PX * M_PER_UM
+    speed, _ = channel_profile(law, 0.5 * width_px * px, SPEED_UM_S * M_PER_UM, across[mask][core] * px)
     exact = speed[:, None] * np.array([np.cos(angle), np.sin(angle)])
-    return 100.0 * float(np.linalg.norm(equations.velocity(flux)[core] - exact) / np.linalg.norm(exact))
+    return relative_percent(equations.velocity(flux)[core], exact)
 
 
 def bend_drop(law: ViscosityLaw, inner_m: float, outer_m: float, flow_m2_s: float) -> float:
@@ -129,8 +127,7 @@ def bend_drop(law: ViscosityLaw, inner_m: float, outer_m: float, flow_m2_s: floa
     The balance along a circle, d(r^2 tau) / dr = -K r, has tau = -K / 2 + C / r^2, and tau = f(gamma) gamma with
     gamma = r d(u / r) / dr. C makes the wall speeds zero, K the flow rate per depth `flow_m2_s`.
     """
-    rates = np.concatenate([[0.0], np.logspace(-8, 8, _RATES - 1)])
-    stresses = rates * law.relative(rates**2)[0]
+    rates, stresses = _flow_curve(law)
     radius = np.linspace(inner_m, outer_m, _ACROSS)
 
     def turning(drop: float, constant: float) -> Floats:
@@ -148,29 +145,17 @@ def bend_drop(law: ViscosityLaw, inner_m: float, outer_m: float, flow_m2_s: floa
 
 def law_bend_case(name: str, k: int) -> dict[str, Any]:
     """Error of the resistance of a quarter of a ring whose walls are exact circles."""
-    inner, outer, law = 12.3, 20.3, LAWS[name]
-
-    def distance(x: Floats, y: Floats) -> Floats:
-        radius = np.hypot(x + 0.5, y + 0.5)
-        return np.asarray(np.minimum(radius - inner, outer - radius))
-
-    y, x = np.mgrid[:26, :26].astype(float)
-    mask = distance(x, y) > 0.0
-    end = np.flatnonzero(mask[:, 0])
-    ends = int(end[0]), int(end[-1])
-    openings = (Opening("left", *ends, "inlet", _SPEED_UM_S), Opening("top", *ends, "outlet", 0.0))
-    chip = Chip("bend", mask, _UM_PER_PX, openings, 1.0, 1000.0, law=law)
-    equations = generalised_equations(chip, law, k, from_distance(distance, mask.shape, k))
+    law = LAWS[name]
+    chip = bend(law)
+    equations = generalised_equations(chip, law, k, from_distance(bend_distance, chip.mask.shape, k))
     scales = Scales.of(chip, k, False)
     flux = equations.steady(scales.drive, 0.0, 100, 1e-9)
     load = equations.residual(flux, scales.drive, 0.0)
     pressure = equations.grid.pressure(equations.pressure(load)) * scales.pressure
-    turn, radius = np.arctan2(y + 0.5, x + 0.5), np.hypot(x + 0.5, y + 0.5)
-    core = (np.abs(radius - 0.5 * (inner + outer)) < 1.5) & (np.abs(turn - np.pi / 4) < 0.2)
-    slope = float(np.polyfit(turn[core], pressure[core], 1)[0])
-    px = _UM_PER_PX * M_PER_UM
-    exact = bend_drop(law, inner * px, outer * px, _SPEED_UM_S * M_PER_UM * len(end) * px)
-    return {"law": name, "k": k, "resistance_error_percent": 100.0 * (slope / (PA_S_PER_MPA_S * exact) - 1.0)}
+    px = UM_PER_PX * M_PER_UM
+    exact = bend_drop(law, INNER_PX * px, OUTER_PX * px, SPEED_UM_S * M_PER_UM * chip.openings[0].width_px * px)
+    error_percent = 100.0 * (bend_slope(pressure) / (PA_S_PER_MPA_S * exact) - 1.0)
+    return {"law": name, "k": k, "resistance_error_percent": error_percent}
 
 
 def law_speed_case(pattern: str, chip: Chip, k: int, repeats: int) -> list[dict[str, Any]]:
