@@ -136,7 +136,7 @@ def _alarms(estimates: list[Estimate]) -> tuple[str, float | None]:
         health = monitor.watch(health, before, estimate, None, ROBOT)
         before = estimate
         if health.alarm:
-            names |= set(health.alarm.split("; "))
+            names |= set(health.alarms)
             first = seconds(estimate.stamp_ns) if first is None else first
     return ", ".join(sorted(names)), first
 

@@ -96,4 +96,4 @@ from .vision.learning import (
 )
 from .vision.track_quality import TrackQuality as TrackQuality
 from .vision.tracker import Tracker as Tracker
-from .vision.walls import walls_in_view as walls_in_view
+from .vision.walls import seen_walls as seen_walls

@@ -47,7 +47,7 @@ from flowrec.stages import (
     bodies_like,
     bodies_that_stand_out,
     look,
-    walls_in_view,
+    seen_walls,
 )
 from flowrec.verbs.preparation import Prepared, prepare
 
@@ -333,9 +333,7 @@ def _factor(image: Image) -> int:
 
 def _candidates(p: Pipeline, frame: Frame, sight: Sight) -> tuple[Floats, str]:
     """Places (n, 2) in px from the top down, and how they are told of."""
-    walls, calibration = walls_in_view(p.chip, p.calibration, p.image_shape), p.calibration
-    if any(off_px := shift_px(sight.shift)):
-        walls, calibration = walls.for_shift(off_px), calibration.for_shift(off_px)
+    walls, calibration = seen_walls(p.chip, p.calibration, p.image_shape, shift_px(sight.shift))
     radius_px = p.robot.radius_um / calibration.um_per_px
     view = View(frame.image, walls, radius_px, -p.tracker.wall_error_radii * radius_px)
     if sight.appearance is None or sight.track is None or not sight.track.seen:

@@ -51,7 +51,7 @@ class StateLogger:
                 self._log_state(e.SIGHT, _NONE if message.seen else "Not seen", colours.RED)
             case Health():
                 # That the robot is not seen has a lane of its own.
-                alarms = [name for name in message.alarm.split("; ") if name and name != Alarm.TRACKING]
+                alarms = [name for name in message.alarms if name != Alarm.TRACKING]
                 self._log_state(e.ALARM, ", ".join(ALARM_WORDS.get(name, name) for name in alarms), colours.RED)
             case OperatorEvent(action=action, text=said):
                 text = f"{action} {said}" if action in (Action.GOAL, Action.SPEED) else said

@@ -6,9 +6,10 @@ import pytest
 import flowrec
 from flowrec.core import ChipError, Tick, bilinear
 from flowrec.physics import ChipSettings, clearance_um, load_chip
-from flowrec.stages import calibration_of, load_config, walls_in_view
+from flowrec.stages import calibration_of, load_config
 from flowrec.stages.control import axes_check
 from flowrec.stages.resolve import resolve
+from flowrec.stages.vision.walls import walls_in_view
 from flowrec.verbs.check import check
 from flowrec.verbs.record import record
 from flowrec.view import rows_of_run

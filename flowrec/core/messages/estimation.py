@@ -55,6 +55,11 @@ class Estimate(Message):
         "the robot's own motion through the fluid (2,), averaged over time as `flow_um_s` is; (0,): not known",
     ] = NOT_STATED
 
+    @property
+    def flow_variance(self) -> float:
+        """Variance of the flow, um2/s2, mean of both components."""
+        return 0.5 * float(self.covariance[2, 2] + self.covariance[3, 3])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Health(Message):
@@ -90,6 +95,11 @@ class Health(Message):
         "um/s rolled and um/s expected from the revolutions (2,), just before the limit was lowered; (0,): no limit "
         "to test",
     ] = NOT_STATED
+
+    @property
+    def alarms(self) -> list[str]:
+        """The words of the alarm."""
+        return [word for word in self.alarm.split("; ") if word]
 
 
 WALLS = "/robots/walls"  # path of the topic

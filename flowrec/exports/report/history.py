@@ -209,7 +209,7 @@ class History:
 
     def _health(self, health: Health) -> None:
         self._put(health.stamp_ns, nis=health.nis)
-        now = set(map(_name, health.alarm.split("; ")[:_MOST_ALARMS])) - {""}
+        now = set(map(_name, health.alarms[:_MOST_ALARMS])) - {""}
         for name in now | self.alarms.keys():
             if name not in self.alarms and len(self.alarms) >= _MOST_ALARMS:
                 continue

@@ -244,7 +244,7 @@ class Controller:
         if now.mission.by_hand:  # and afterwards goes on along the route from where it was taken
             return Reference.at_rest(now.predicted_um, now.estimate, now.previous.progress_s if now.previous else 0.0)
         if driven:
-            return _where_it_is(now)
+            return Reference.at_rest(_where_it_is(now), now.estimate, 0.0)
         route = now.route
         following = not now.mission.finished and now.mission.phase in _FOLLOWING
         if not following or route is None or not len(route.waypoints_um) or _hold_ns(now.mission) is not None:
@@ -278,10 +278,9 @@ def _by_hand(now: Situation, share: Floats) -> tuple[Floats, bool]:
     return limit_length(share * now.limit_um_s, now.limit_um_s)
 
 
-def _where_it_is(now: Situation) -> Reference:
-    """The predicted position as the reference, from which the robot is held afterwards; NaN where it is not seen."""
-    here_um = now.predicted_um if now.estimate.seen else np.full(2, np.nan)
-    return Reference.at_rest(here_um, now.estimate, 0.0)
+def _where_it_is(now: Situation) -> Floats:
+    """The predicted position, from which the robot is held afterwards; NaN where it is not seen."""
+    return now.predicted_um if now.estimate.seen else np.full(2, np.nan)
 
 
 def _hold_position(now: Situation) -> Floats:
@@ -294,7 +293,7 @@ def _hold_position(now: Situation) -> Floats:
     if mission.phase == Phase.OBSERVE:
         return np.full(2, np.nan)
     if previous is None or not np.isfinite(previous.reference_um).all():
-        return now.predicted_um if now.estimate.seen else np.full(2, np.nan)
+        return _where_it_is(now)
     if mission.finished:
         return previous.reference_um
     if not now.estimate.seen and not previous.velocity_um_s.any():

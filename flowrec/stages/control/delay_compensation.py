@@ -47,7 +47,7 @@ def corrected_flow(
         map_std = max(0.3 * map_std, float(field.std_um_s[nearest_pixel(x, y, field.std_um_s.shape)].max()))
     velocity = mapped + sent_um_s[0] if len(sent_um_s) else mapped
     change = mapped - sample(field, estimate.position_um - lag_s * velocity)
-    variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3]) + float(change @ change)
+    variance = estimate.flow_variance + float(change @ change)
     residual = estimate.flow_um_s - mapped
     length = math.hypot(*residual)
     weight = min(map_std**2 / (map_std**2 + variance), 2.0 * map_std / length if length > 0.0 else 1.0)

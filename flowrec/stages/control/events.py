@@ -130,8 +130,8 @@ def _health(before: Health | None, health: Health | None) -> Iterator[Line]:
     """Alarms that began or ended, and a frequency limit that was lowered because of step-out, or lifted."""
     if health is None or health is before:
         return
-    was = set() if before is None else set(before.alarm.split("; ")) - {""}
-    now = set(health.alarm.split("; ")) - {""}
+    was = set() if before is None else set(before.alarms)
+    now = set(health.alarms)
     texts: dict[str, str] = {}
     if now - was:
         texts = {

@@ -161,13 +161,24 @@ def compensate_flow(over_ground_um_s: Floats, flow_um_s: Floats, limit_um_s: flo
     demand = over_ground_um_s - flow_um_s
     if math.hypot(*demand) <= limit_um_s:
         return demand, False
+    within = factors_within(over_ground_um_s, flow_um_s, limit_um_s)
+    if within is None:
+        return limit_length(demand, limit_um_s)
+    s = min(max(1.0, within[0]), within[1])
+    return limit_length(s * over_ground_um_s - flow_um_s, limit_um_s)[0], True
+
+
+def factors_within(over_ground_um_s: Floats, flow_um_s: Floats, limit_um_s: float) -> tuple[float, float] | None:
+    """The least and the largest s for which |s g - v| is within the limit, of a velocity g over ground in a flow v.
+
+    Where there is none, both are the s of the least speed. None: g is zero.
+    """
     gg = float(over_ground_um_s @ over_ground_um_s)
     if gg <= 0.0:
-        return limit_length(demand, limit_um_s)
+        return None
     gv = float(over_ground_um_s @ flow_um_s)
     root = math.sqrt(max(gv * gv - gg * (float(flow_um_s @ flow_um_s) - limit_um_s**2), 0.0))
-    s = min(max(1.0, (gv - root) / gg), (gv + root) / gg)
-    return limit_length(s * over_ground_um_s - flow_um_s, limit_um_s)[0], True
+    return (gv - root) / gg, (gv + root) / gg
 
 
 def limit_length(vector: Floats, limit: float) -> tuple[Floats, bool]:

@@ -8,7 +8,7 @@ from bisect import bisect_right
 import numpy as np
 
 from flowrec.core import Floats, Route
-from flowrec.stages.control.tracking_laws import Reference, Situation
+from flowrec.stages.control.tracking_laws import Reference, Situation, factors_within
 
 
 def follow(now: Situation, route: Route, lag_free_um: float, lag_full_um: float, pace_fraction: float) -> Reference:
@@ -95,9 +95,5 @@ def feasible_pace(velocity_um_s: Floats, flow_um_s: Floats, limit_um_s: float, m
     speed: the robot is swept away, but the reference does not leave it behind as well. A flow that is faster than the
     reference in its direction does not slow it down.
     """
-    gg = float(velocity_um_s @ velocity_um_s)
-    if gg <= 0.0:
-        return most
-    gv = float(velocity_um_s @ flow_um_s)
-    radicand = gv * gv - gg * (float(flow_um_s @ flow_um_s) - limit_um_s**2)
-    return min(max((gv + math.sqrt(max(radicand, 0.0))) / gg, 0.0), most)
+    within = factors_within(velocity_um_s, flow_um_s, limit_um_s)
+    return most if within is None else min(max(within[1], 0.0), most)

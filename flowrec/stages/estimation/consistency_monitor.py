@@ -195,7 +195,8 @@ class HealthMonitor:
         """
         bank_hz = _bank_hz(self.slowest_hz)
         if previous is None or before is None:
-            return _first_health(estimate.stamp_ns, np.zeros(len(bank_hz)))
+            bank = (np.zeros(len(bank_hz)),) * 3
+            return Health(estimate.stamp_ns, "", EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, *bank, np.zeros(2), 0.0)
         dt = max(seconds(estimate.stamp_ns - before.stamp_ns), 0.0)
         weight = min(dt / self.window_s, 1.0)
         lost = previous.lost_share + weight * (float(not estimate.seen) - previous.lost_share)
@@ -204,7 +205,7 @@ class HealthMonitor:
             nis += weight * (min(estimate.nis, _LARGEST_NIS) - nis)
         settled_s, mean, offset = previous.heard_s, previous.mean_um_s, previous.offset_share
         deviation = heard_s = 0.0
-        variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3])
+        variance = estimate.flow_variance
         if estimate.seen and dt > 0.0 and variance < (self.settled_share * robot.max_speed_um_s) ** 2:
             settled_s += dt
             mean = mean + weight * (estimate.flow_um_s - mean)
@@ -228,7 +229,7 @@ class HealthMonitor:
         now = replace(
             previous,
             stamp_ns=estimate.stamp_ns,
-            alarm=self._alarms(previous.alarm.split("; "), levels),
+            alarm=self._alarms(previous.alarms, levels),
             nis=nis,
             lost_share=lost,
             heard_s=settled_s,
@@ -245,10 +246,6 @@ class HealthMonitor:
 
     def _alarms(self, active: list[str], levels: dict[Alarm, float]) -> str:
         return "; ".join(name for name, level in levels.items() if level > (self.ends_at if name in active else 1.0))
-
-
-def _first_health(stamp_ns: int, bank: Floats) -> Health:
-    return Health(stamp_ns, "", EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0)
 
 
 @compiled

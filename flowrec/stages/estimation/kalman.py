@@ -252,6 +252,11 @@ def memory_s(covariance: Floats) -> float:
     return float(min(0.5 * (covariance[0, 0] + covariance[1, 1]) / coupling, 1.0))
 
 
+def newest_share(dt_s: float, memory: float) -> float:
+    """Share of the newest value in a mean with a memory in s, after a time dt_s."""
+    return 1.0 - math.exp(-max(dt_s, 0.0) / memory) if memory > 0.0 else 1.0
+
+
 def lag_s(estimate: Estimate) -> float:
     """Lag of the estimated flow behind the true one: the filter's memory where it assumes a constant flow.
 

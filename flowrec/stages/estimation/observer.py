@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Method, Methods, Share, Track, seconds
 from flowrec.physics import Robot
-from flowrec.stages.estimation.kalman import Kalman, corrects_map, memory_s
+from flowrec.stages.estimation.kalman import Kalman, corrects_map, memory_s, newest_share
 from flowrec.stages.estimation.luenberger import Luenberger
 
 _GIVEN_UP = 1.5  # times the deviation at which a map is taken up
@@ -118,7 +117,7 @@ class Observer:
         if health is None:
             return True
         most = self.map_good_share * (_GIVEN_UP if previous is not None and corrects_map(previous) else 1.0)
-        return Alarm.NIS not in health.alarm.split("; ") and abs(health.offset_share) <= most
+        return Alarm.NIS not in health.alarms and abs(health.offset_share) <= most
 
 
 def _with_own_motion(previous: Estimate | None, estimate: Estimate, applied: Applied, robot: Robot) -> Estimate:
@@ -129,6 +128,5 @@ def _with_own_motion(previous: Estimate | None, estimate: Estimate, applied: App
     um_per_rev = robot.um_per_rev if estimate.um_per_rev is None else estimate.um_per_rev
     now = um_per_rev / dt * applied.turns
     before = previous.rolled_um_s if previous.rolled_um_s.size else now
-    memory = memory_s(estimate.covariance)
-    weight = 1.0 - math.exp(-dt / memory) if memory > 0.0 else 1.0
+    weight = newest_share(dt, memory_s(estimate.covariance))
     return replace(estimate, rolled_um_s=before + weight * (now - before))

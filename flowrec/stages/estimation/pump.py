@@ -8,7 +8,6 @@ that a refinement sees a steady flow; the error of the measurement is added to t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -34,7 +33,7 @@ from flowrec.core import (
     seconds,
 )
 from flowrec.physics import Chip
-from flowrec.stages.estimation.kalman import memory_s
+from flowrec.stages.estimation.kalman import memory_s, newest_share
 from flowrec.stages.estimation.superposition import Superposition, at_share
 
 _SLOW_S = 5.0  # memory of the mean that plans are made with
@@ -150,16 +149,16 @@ class PumpFollower:
             return None if known is None else PumpShare(tick.stamp_ns, *(known[1][-1],) * 3, int(known[0][-1]))
         share, sample_ns = previous.share, previous.sample_ns
         for time_ns, value in zip(*known, strict=True) if known is not None else ():
-            share += (value - share) * _weight(seconds(int(time_ns) - sample_ns), self.smoothing_s)
+            share += (value - share) * newest_share(seconds(int(time_ns) - sample_ns), self.smoothing_s)
             sample_ns = max(int(time_ns), sample_ns)
         dt_s = seconds(tick.stamp_ns - previous.stamp_ns)
-        slow = previous.slow_share + (share - previous.slow_share) * _weight(dt_s, _SLOW_S)
+        slow = previous.slow_share + (share - previous.slow_share) * newest_share(dt_s, _SLOW_S)
         # The share is that much behind already.
         filter_s = max(_filter_s(last) - self.delay_s, 0.0)
-        observed = previous.observed_share + (share - previous.observed_share) * _weight(dt_s, filter_s)
+        observed = previous.observed_share + (share - previous.observed_share) * newest_share(dt_s, filter_s)
         return PumpShare(tick.stamp_ns, float(share), float(slow), float(observed), sample_ns)
 
-    def mean_share(self, pump: PumpShare, began_s: np.ndarray, ended_s: np.ndarray) -> np.ndarray:
+    def mean_share(self, pump: PumpShare, began_s: Floats, ended_s: Floats) -> Floats:
         """(n,) means of the share over times (n,), (n,); what the sensor will tell within its delay is as it is now.
 
         A time before the first mark counts as the first.
@@ -171,9 +170,7 @@ class PumpFollower:
         lasted_s = known_s[1] - known_s[0]
         return np.divide(ended - began, lasted_s, out=np.full(len(began_s), pump.share), where=lasted_s > 0.0)
 
-    def _measurement(
-        self, last: Tick, tick: Tick, channel: str, nominal: float
-    ) -> tuple[np.ndarray, np.ndarray] | None:
+    def _measurement(self, last: Tick, tick: Tick, channel: str, nominal: float) -> tuple[Floats, Floats] | None:
         """Times and values, over the nominal one, of the samples of this tick; None without any."""
         samples, states = tick.extra.get(SAMPLES), tick.extra.get(STREAMS)
         if not isinstance(samples, Samples) or not isinstance(states, StreamStates):
@@ -206,14 +203,14 @@ class PumpFollower:
         return newest if len(now.std_um_s) == 1 else now.only(slice(None, -1)).followed_by(newest)
 
     def stretches_at_nominal(
-        self, pump: PumpShare, new: Observations, began_s: np.ndarray, ended_s: np.ndarray
+        self, pump: PumpShare, new: Observations, began_s: Floats, ended_s: Floats
     ) -> Observations | None:
         """Observations that are means over times (n,), (n,), as those of the nominal flow; None if none is left."""
         share = self.mean_share(pump, began_s, ended_s)
         flows = share >= _LEAST
         return self._over(new.only(flows), share[flows]) if flows.any() else None
 
-    def _over(self, observed: Observations, share: np.ndarray) -> Observations:
+    def _over(self, observed: Observations, share: Floats) -> Observations:
         """Observations over the shares (n,) of their times, with the error of the measured ones in theirs."""
         error_um_s = self.error_share * np.hypot(*observed.flow_um_s.T)
         return replace(
@@ -232,11 +229,6 @@ def _with_marks(previous: PumpShare, now: PumpShare, memory_s: float) -> PumpSha
         marks, flowed = marks[:-1], flowed[:-1]
     kept = slice(-_MARKS - 2, None)  # two more: the time of an image, and the mark that the memory ends in
     return replace(now, mark_s=np.append(marks[kept], time_s), flowed_s=np.append(flowed[kept], total))
-
-
-def _weight(dt_s: float, memory: float) -> float:
-    """Weight of a new value in an exponential mean."""
-    return 1.0 - math.exp(-max(dt_s, 0.0) / memory) if memory > 0.0 else 1.0
 
 
 def _filter_s(last: Tick) -> float:

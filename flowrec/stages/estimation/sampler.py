@@ -125,7 +125,7 @@ class Sampler:
         ----------
         before : the estimate of the frame before.
         """
-        variance = 0.5 * (estimate.covariance[2, 2] + estimate.covariance[3, 3])
+        variance = estimate.flow_variance
         if before is None or not estimate.seen or not before.seen:
             return previous
         if not estimate.nis < _OUTLIER_NIS and not math.isnan(estimate.nis):

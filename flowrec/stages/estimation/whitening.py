@@ -38,7 +38,7 @@ class NoiseModel:
 
 @compiled
 def _innovations(
-    time_s: Floats, columns: Floats, flags: Flags, error: float, drift: float, agility: float, unknown: float
+    time_s: Floats, columns: Floats, flags: Flags, error: float, drift: float, agility: float
 ) -> tuple[Floats, Floats]:
     """Innovations (n, m) divided by their standard deviation, and the logarithm (n,) of that; 0 where none is due."""
     n, m = columns.shape
@@ -50,13 +50,13 @@ def _innovations(
     before = -1  # the frame of the state
     seen = 0
     for i in range(n):
-        if flags[i] == 1:
+        if flags[i] == SKIPPED:
             continue
-        if before < 0 or flags[i] == 2:
+        if before < 0 or flags[i] == RESTART:
             for j in range(m):
                 position[j] = columns[i, j]
                 velocity[j] = 0.0
-            pxx, pxv, pvv = error, 0.0, unknown
+            pxx, pxv, pvv = error, 0.0, _UNKNOWN_UM2_S2
             before = i
             seen = 1
             continue
@@ -90,10 +90,7 @@ def whiten(time_s: Floats, columns: Floats, flags: Flags, noise: NoiseModel) -> 
     They are 0 at skipped frames and at the first two of each stretch.
     """
     columns = np.ascontiguousarray(columns, np.float64)
-    white, _ = _innovations(
-        time_s, columns, flags, noise.error_um2, noise.drift_um2_s, noise.agility_um2_s3, _UNKNOWN_UM2_S2
-    )
-    return white
+    return _innovations(time_s, columns, flags, noise.error_um2, noise.drift_um2_s, noise.agility_um2_s3)[0]
 
 
 def fit_noise(time_s: Floats, positions_um: Floats, flags: Flags, start: NoiseModel | None = None) -> NoiseModel:
@@ -107,7 +104,7 @@ def fit_noise(time_s: Floats, positions_um: Floats, flags: Flags, start: NoiseMo
 
     def cost(logs: Floats) -> float:
         error, drift, agility = np.exp(np.clip(logs, -60.0, 60.0)).tolist()
-        white, log_std = _innovations(time_s, positions, flags, error, error * drift, error * agility, _UNKNOWN_UM2_S2)
+        white, log_std = _innovations(time_s, positions, flags, error, error * drift, error * agility)
         square = (white**2).sum(1)
         return float(axes * log_std.sum() + 0.5 * (FREEDOM + axes) * np.log1p(square / FREEDOM).sum())
 
@@ -135,7 +132,6 @@ def _gate(
     drift: float,
     agility: float,
     gate: float,
-    patience: int,
 ) -> Flags:
     """See `without_jumps`."""
     n = positions.shape[0]
@@ -145,12 +141,12 @@ def _gate(
     before, refused, seen = -1, 0, 0
     i = 0
     while i < n:
-        if flags[i] == 1:
+        if flags[i] == SKIPPED:
             i += 1
             continue
-        if before < 0 or out[i] == 2:
+        if before < 0 or out[i] == RESTART:
             x, y, vx, vy = positions[i, 0], positions[i, 1], 0.0, 0.0
-            pxx, pxv, pvv = error, 0.0, 1e10
+            pxx, pxv, pvv = error, 0.0, _UNKNOWN_UM2_S2
             before, refused, seen = i, 0, 1
             i += 1
             continue
@@ -161,17 +157,17 @@ def _gate(
         total = axx + error
         ex, ey = positions[i, 0] - x - dt * vx, positions[i, 1] - y - dt * vy
         if seen >= 2 and ex**2 + ey**2 > gate**2 * total:
-            out[i] = 1
+            out[i] = SKIPPED
             refused += 1
-            if refused >= patience:  # it stays there: another stretch begins where it began to differ
+            if refused >= _PATIENCE:  # it stays there: another stretch begins where it began to differ
                 back = i
                 while refused > 1:
                     back -= 1
-                    if flags[back] != 1:
+                    if flags[back] != SKIPPED:
                         refused -= 1
                 for j in range(back, i + 1):
                     out[j] = flags[j]
-                out[back] = 2
+                out[back] = RESTART
                 i = back
                 continue
             i += 1
@@ -192,5 +188,4 @@ def without_jumps(time_s: Floats, positions_um: Floats, flags: Flags, noise: Noi
     it did what the model does not know. Another stretch begins there.
     """
     positions = np.ascontiguousarray(positions_um, np.float64)
-    e, d, a = noise.error_um2, noise.drift_um2_s, noise.agility_um2_s3
-    return _gate(time_s, positions, flags, e, d, a, gate, _PATIENCE)
+    return _gate(time_s, positions, flags, noise.error_um2, noise.drift_um2_s, noise.agility_um2_s3, gate)

@@ -13,7 +13,8 @@ from flowrec.stages.vision.disc_fit import fit_disc, fit_radius, initial_edge_px
 from flowrec.stages.vision.masked_ncc import masked_ncc, template
 from flowrec.stages.vision.walls import Box, Walls
 
-LARGEST = 1.35  # greatest expected radius relative to the robot's own
+_SMALLEST, _LARGEST = 0.75, 1.35  # least and greatest tracked radius relative to the robot's own
+_RADIUS_WEIGHT = 0.05  # of the newest radius in the tracked one: focus drifts, single frames are unreliable
 _COARSE_RADIUS_PX = 2.5  # of the robot in the reduced image in which candidates are found
 _FINE_RADIUS_PX = 6.0  # of the robot in the image that the disc is fitted to, unless it is smaller in the camera's
 _LEAST_CORRELATION = 0.35  # of a candidate
@@ -150,9 +151,15 @@ def disc_pad_px(nominal: float) -> int:
     # exceed the region by all but a pixel.
     correlated = coarse * (len(template(nominal, coarse)) // 2 + 1) - 1
     # A disc is fitted around the middle of a block, to blocks that begin on whole pixels.
-    largest = LARGEST * nominal
+    largest = _LARGEST * nominal
     fitted = 0.5 * (coarse - 1) + fit_radius(largest, initial_edge_px(largest)) + 1.0
     return max(correlated, math.ceil(fitted))
+
+
+def tracked_radius_px(before_px: float, found: Disc, nominal_px: float) -> float:
+    """The radius of a robot by all discs so far, of which the newest is `found`."""
+    radius_px = before_px + _RADIUS_WEIGHT * (found.radius_px - before_px)
+    return min(max(radius_px, _SMALLEST * nominal_px), _LARGEST * nominal_px)
 
 
 def coarse_step(nominal_px: float) -> int:

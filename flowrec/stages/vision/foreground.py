@@ -106,6 +106,13 @@ def _block_means(
 
 
 @compiled
+def _above_noise(value: float, sign: int) -> tuple[float, float]:
+    """Foreground over its noise, 0 where it has the other sign, as of `energy_map`; its square above that of noise."""
+    value = 0.0 if sign * value < 0.0 else value
+    return value, max(value * value - _NOISE_FLOOR * _NOISE_FLOOR, 0.0)
+
+
+@compiled
 def energy_map(c: Floats32, noise: float, sign: int, half: int) -> Floats32:
     """Mean of the squared foreground, in units of its noise, over (2 half + 1)^2 blocks, taken twice.
 
@@ -115,10 +122,7 @@ def energy_map(c: Floats32, noise: float, sign: int, half: int) -> Floats32:
     energy = np.empty((rows, columns), np.float32)
     for j in range(rows):
         for i in range(columns):
-            value = c[j, i] / noise
-            if sign * value < 0.0:
-                value = 0.0
-            energy[j, i] = max(value * value - _NOISE_FLOOR * _NOISE_FLOOR, 0.0)
+            energy[j, i] = _above_noise(c[j, i] / noise, sign)[1]
     for _ in range(2):
         energy = _box_mean(energy, half)
     return energy
@@ -203,10 +207,7 @@ def silhouette_centroid(
         for j in range(j0, j1):
             for i in range(i0, i1):
                 if (i - x) ** 2 + (j - y) ** 2 <= radius * radius:
-                    value = c[j, i] / noise
-                    if sign * value < 0.0:
-                        value = 0.0
-                    e = max(value * value - _NOISE_FLOOR * _NOISE_FLOOR, 0.0)
+                    _, e = _above_noise(c[j, i] / noise, sign)
                     energy += e
                     fourth += e * e
                     count += 1.0
@@ -222,10 +223,7 @@ def silhouette_centroid(
             for i in range(i0, i1):
                 rho2 = (i - x) ** 2 + (j - y) ** 2
                 if rho2 <= (radius + 1.0) ** 2:
-                    value = c[j, i] / noise
-                    if sign * value < 0.0:
-                        value = 0.0
-                    e = max(value * value - _NOISE_FLOOR * _NOISE_FLOOR, 0.0)
+                    value, e = _above_noise(c[j, i] / noise, sign)
                     edge = min(max(radius + 0.5 - math.sqrt(rho2), 0.0), 1.0)  # no step as pixels enter the window
                     w = edge * (max(abs(value) - faint, 0.0) if sign != 0 else e / (e + half))
                     total += w
@@ -233,11 +231,7 @@ def silhouette_centroid(
                     sum_y += w * j
         if total < 1e-9:
             break
-        moved = math.hypot(sum_x / total - x, sum_y / total - y)
         x, y = sum_x / total, sum_y / total
-        if moved < 1e-3 and move < moves - 1:
-            # Converged: one more pass gives the energy there.
-            continue
     return x, y, energy, math.sqrt(level)
 
 

@@ -64,8 +64,7 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
         return None
     share = np.clip([body.darkness / part.level for body in bodies], *_SHARES)
     precision = np.array([1.0 / max(body.variance_px2, _LEAST_VARIANCE_PX2) for body in bodies])
-    apart = np.hypot(*(expected[:, None] - expected).transpose(2, 0, 1)) / (radii[:, None] + radii)
-    as_one = bool((apart[np.triu_indices(len(bodies), 1)] < _HIDDEN).any())
+    as_one = bool((distances(expected, radii)[np.triu_indices(len(bodies), 1)] < _HIDDEN).any())
     known = _Prior(expected, precision, radii, share)
     one_by_one = np.eye(2 * len(bodies))
     if as_one:
@@ -80,6 +79,11 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
     variance = float(((part.grey - part.level) ** 2).sum())
     shown = best.residual <= (1.0 - _LEAST_LIKENESS**2) * variance
     return best.places if shown and np.isfinite(best.places).all() else None
+
+
+def distances(places: Floats, radii: Floats) -> Floats:
+    """(n, n) between bodies at places (n, 2), over the sum of their radii (n,)."""
+    return np.asarray(np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) / (radii[:, None] + radii))
 
 
 class _Prior(NamedTuple):

@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 
 from flowrec.core import Bools, Floats, Frame, Ints, Track, seconds
 from flowrec.physics import Calibration, Robot
-from flowrec.stages.vision.disc_search import LARGEST, Disc, DiscSearch, discs
-from flowrec.stages.vision.joint_fit import Body, fit_jointly
+from flowrec.stages.vision.disc_search import Disc, DiscSearch, discs, tracked_radius_px
+from flowrec.stages.vision.joint_fit import Body, distances, fit_jointly
 from flowrec.stages.vision.tracers import assign
+from flowrec.stages.vision.trackers import unseen
 from flowrec.stages.vision.walls import Walls
 
 _TOUCH = 1.25  # of the sum of two radii: nearer robots are fitted together
 _SAME_RADII = 0.7  # between two discs that are one
-_RADIUS_WEIGHT, _ENERGY_WEIGHT = 0.05, 0.05  # of the newest look in the tracked one
-_SMALLEST = 0.75  # least radius relative to the robot's own
+_ENERGY_WEIGHT = 0.05  # of the newest look in the tracked one
 _LOOKS = (0.12, 0.25)  # one sigma of ln radius and ln darkness of one robot
 _MOST_UNLIKE = 9.0  # of the cost: beyond it a disc is an outlier of a robot's look
 _GATE = 16.0  # as of `assign`: four standard deviations
@@ -80,8 +80,10 @@ def first_tracks(sought: Sought, count: int, at_um: Sequence[Floats]) -> list[Tr
         found = [disc for disc in found if disc is not nearest]
     height, width = sought.frame.image.shape
     middle_um = sought.calibration.to_um(((width - 1) / 2, (height - 1) / 2))
-    nobody = Track(sought.frame.stamp_ns, False, middle_um, 0.0, 0, sought.search.nominal_px, _roi(sought))
-    return [_see(sought, nobody, disc) if disc is not None else _miss(sought, nobody) for disc in chosen]
+    roi_px = np.array(sought.walls.box, np.float64)
+    stamp_ns = sought.frame.stamp_ns
+    nobody = Track(stamp_ns, False, middle_um, 0.0, 0, sought.search.nominal_px, roi_px)
+    return [_see(sought, nobody, disc) if disc is not None else unseen(nobody, stamp_ns) for disc in chosen]
 
 
 def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Expected]) -> list[Track]:
@@ -90,7 +92,7 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
     um_per_px = sought.calibration.um_per_px
     std_um = np.hypot([each.std_um for each in expected], _FIT_RADII * sought.robot.radius_um)
     radii = np.array([track.radius_px for track in previous])
-    apart = np.hypot(*(px[:, None] - px).transpose(2, 0, 1)) / (radii[:, None] + radii)
+    apart = distances(px, radii)
     np.fill_diagonal(apart, np.inf)
     known = np.array([track.score > 0.0 for track in previous])
     apart[~known] = apart[:, ~known] = np.inf
@@ -99,7 +101,10 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
     places: dict[int, Floats] = {}
     for group in _groups(apart[np.ix_(~lost, ~lost)] < _TOUCH):
         members = np.flatnonzero(~lost)[group].tolist()
-        bodies = [_body(sought, previous[n], px[n], float(std_um[n]) / um_per_px) for n in members]
+        bodies = [
+            Body(px[n], (float(std_um[n]) / um_per_px) ** 2, previous[n].radius_px, _darkness(sought, previous[n]))
+            for n in members
+        ]
         fitted = fit_jointly(sought.image, sought.walls, sought.search.margin_px, bodies)
         places |= {} if fitted is None else dict(zip(members, fitted, strict=True))
     alone = [n for n in range(len(previous)) if n not in places]
@@ -131,7 +136,7 @@ def next_tracks(sought: Sought, previous: Sequence[Track], expected: Sequence[Ex
         elif n in pairs:
             tracks.append(_see(sought, track, pairs[n]))
         else:
-            tracks.append(_miss(sought, track))
+            tracks.append(unseen(track, sought.frame.stamp_ns))
     return tracks
 
 
@@ -189,10 +194,6 @@ def _darkness(sought: Sought, track: Track) -> float:
     return math.sqrt(track.energy) * sought.noise
 
 
-def _body(sought: Sought, track: Track, at_px: Floats, std_px: float) -> Body:
-    return Body(at_px, std_px**2, track.radius_px, _darkness(sought, track))
-
-
 def _unlike(sought: Sought, track: Track, disc: Disc) -> float:
     """Cost of taking a disc for a robot of another look."""
     if track.energy <= 0.0:
@@ -204,9 +205,8 @@ def _unlike(sought: Sought, track: Track, disc: Disc) -> float:
 
 def _see(sought: Sought, track: Track, disc: Disc) -> Track:
     """The track of a robot that is a disc by itself."""
-    nominal, energy = sought.search.nominal_px, (disc.darkness / sought.noise) ** 2
-    first = track.energy <= 0.0
-    radius_px = disc.radius_px if first else track.radius_px + _RADIUS_WEIGHT * (disc.radius_px - track.radius_px)
+    first, energy = track.energy <= 0.0, (disc.darkness / sought.noise) ** 2
+    before_px = disc.radius_px if first else track.radius_px
     return replace(
         track,
         stamp_ns=sought.frame.stamp_ns,
@@ -214,14 +214,6 @@ def _see(sought: Sought, track: Track, disc: Disc) -> Track:
         position_um=sought.calibration.to_um((disc.x, disc.y)),
         score=disc.score,
         lost_frames=0,
-        radius_px=min(max(radius_px, _SMALLEST * nominal), LARGEST * nominal),
+        radius_px=tracked_radius_px(before_px, disc, sought.search.nominal_px),
         energy=energy if first else track.energy + _ENERGY_WEIGHT * (energy - track.energy),
     )
-
-
-def _miss(sought: Sought, track: Track) -> Track:
-    return replace(track, stamp_ns=sought.frame.stamp_ns, seen=False, lost_frames=track.lost_frames + 1)
-
-
-def _roi(sought: Sought) -> Floats:
-    return np.array(sought.walls.box, np.float64)

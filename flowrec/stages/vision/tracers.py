@@ -19,7 +19,7 @@ import numpy as np
 from flowrec.core import Bools, Floats, Frame, Ints, Range, Tracers, Track, seconds
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.spots import SpotSearch
-from flowrec.stages.vision.walls import Walls, walls_in_view
+from flowrec.stages.vision.walls import Walls, seen_walls
 
 _RADIUS_SHARE = 0.25  # of the robot's radius, for tracers whose radius is not stated
 _STD_PX = 0.15  # of a spot's place, per component
@@ -91,9 +91,7 @@ class TracerTracker:
 
         `shift_px` (columns, rows): how far the image lies from where the calibration holds. `others`: of other robots.
         """
-        walls = walls_in_view(chip, calibration, frame.image.shape)
-        if any(shift_px):
-            walls, calibration = walls.for_shift(shift_px), calibration.for_shift(shift_px)
+        walls, calibration = seen_walls(chip, calibration, frame.image.shape, shift_px)
         px, _ = self.search(calibration.um_per_px, robot).find(frame.image, walls)
         for each in (track, *others):
             if each is not None and each.seen and len(px):

@@ -21,7 +21,14 @@ import numpy as np
 
 from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, UsageError, seconds
 from flowrec.physics import Calibration, Chip, Robot
-from flowrec.stages.vision.disc_search import LARGEST, Disc, DiscSearch, best_disc, best_disc_normalised, disc_pad_px
+from flowrec.stages.vision.disc_search import (
+    Disc,
+    DiscSearch,
+    best_disc,
+    best_disc_normalised,
+    disc_pad_px,
+    tracked_radius_px,
+)
 from flowrec.stages.vision.learned import (
     Candidates,
     ExpectedMotion,
@@ -42,13 +49,11 @@ from flowrec.stages.vision.learned import (
 from flowrec.stages.vision.learning import box_of, brightest_spot, energy_of, learn, pixel_noise
 from flowrec.stages.vision.several import Expected, Sought, first_tracks, next_tracks
 from flowrec.stages.vision.tracers import TracerTracker
-from flowrec.stages.vision.trackers import TRACKERS, TrackingMethod
-from flowrec.stages.vision.walls import Box, Walls, walls_in_view
+from flowrec.stages.vision.trackers import TRACKERS, TrackingMethod, unseen
+from flowrec.stages.vision.walls import Box, Walls, box_around, seen_walls, walls_in_view
 
 Polarity = Literal["dark", "bright", "auto"]
 _Pixel = Annotated[float, Range(-1e5, 1e5)]
-_SMALLEST = 0.75  # least expected radius relative to the robot's own
-_RADIUS_WEIGHT = 0.05  # of the newest radius in the tracked one: focus drifts, single frames are unreliable
 _LENIENT_SCORE, _LENIENT_LIKENESS = 0.85, 0.9  # of a disc that may be pale or beside a wall: debris has less
 _ENERGY_SHARE = 0.05  # least energy of a candidate relative to the robot's
 
@@ -76,8 +81,7 @@ class _Scene:
         previous, radius_px = self.previous, search.expected_px
         if found is not None:
             place_um, score, lost = self.calibration.to_um((found.x, found.y)), found.score, 0
-            radius_px += _RADIUS_WEIGHT * (found.radius_px - radius_px)
-            radius_px = min(max(radius_px, _SMALLEST * search.nominal_px), LARGEST * search.nominal_px)
+            radius_px = tracked_radius_px(radius_px, found, search.nominal_px)
         elif previous is not None:
             place_um, score, lost = previous.position_um, previous.score, previous.lost_frames + 1
         else:
@@ -188,9 +192,7 @@ class Tracker:
             return self._other.track(previous, frame, chip, moved, robot), None
         if self.polarity is None:
             return self.track(previous, frame, chip, calibration, robot), None
-        walls = walls_in_view(chip, calibration, frame.image.shape)
-        if any(shift_px):
-            walls, calibration = walls.for_shift(shift_px), calibration.for_shift(shift_px)
+        walls, calibration = seen_walls(chip, calibration, frame.image.shape, shift_px)
         scene = _Scene(previous, frame, walls, calibration, robot)
         if appearance is None:
             return self._first_look(scene)
@@ -218,9 +220,7 @@ class Tracker:
 
         Before the first image `previous` is empty. Then the first robot is the one that is nearest to `start_um`.
         """
-        walls = walls_in_view(chip, calibration, frame.image.shape)
-        if any(shift_px):
-            walls, calibration = walls.for_shift(shift_px), calibration.for_shift(shift_px)
+        walls, calibration = seen_walls(chip, calibration, frame.image.shape, shift_px)
         search = self._plan(_Scene(None, frame, walls, calibration, robot), everywhere=True)
         if appearance is None:
             look = "bright" if self.polarity == "bright" else "dark"
@@ -392,9 +392,7 @@ class Tracker:
             frames = 1 + previous.lost_frames
             dt = seconds(scene.frame.stamp_ns - previous.stamp_ns) / frames
             range_px = self._range_px(scene, previous.radius_px, dt) * frames
-            x0, y0, x1, y1 = box
-            left, top = max(math.floor(x - range_px), x0), max(math.floor(y - range_px), y0)
-            box = (left, top, min(math.ceil(x + range_px) + 1, x1), min(math.ceil(y + range_px) + 1, y1))
+            box = box_around(centre, range_px, box)
             # While the robot is lost, an object of low likeness is more probably a piece of debris.
             if not previous.lost_frames:
                 score, likeness = self.least_score, 0.0
@@ -421,14 +419,7 @@ def move_neighbours(previous: Track, by_px: Floats) -> Track:
     return replace(previous, neighbours_px=moved.ravel())
 
 
-def unseen(previous: Track, stamp_ns: int) -> Track:
-    """The track after a frame that shows nothing new."""
-    return replace(previous, stamp_ns=stamp_ns, seen=False, lost_frames=previous.lost_frames + 1)
-
-
 def _clip_box(centre: tuple[float, float], range_px: float, box: Box) -> Box:
-    """The box of a range around a centre, within another box."""
-    x0, y0, x1, y1 = box
-    (x, y), reach = centre, min(range_px, 1e5)
-    left, top = max(math.floor(x - reach), x0), max(math.floor(y - reach), y0)
-    return left, top, max(min(math.ceil(x + reach) + 1, x1), left), max(min(math.ceil(y + reach) + 1, y1), top)
+    """`box_around` that is empty, and not turned inside out, where the range lies beyond the box."""
+    x0, y0, x1, y1 = box_around(centre, min(range_px, 1e5), box)
+    return x0, y0, max(x1, x0), max(y1, y0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 from flowrec.core import Frame, Method, Methods, Track
@@ -12,7 +13,7 @@ class TrackingMethod(Protocol):
     """Interface of another package's row in TRACKERS: the frozen dataclass of its settings, with this method."""
 
     def track(self, previous: Track | None, frame: Frame, chip: Chip, calibration: Calibration, robot: Robot) -> Track:
-        """The robot in this frame. Where it is not seen, `tracker.unseen(previous, frame.stamp_ns)` is its track.
+        """The robot in this frame. Where it is not seen, `unseen(previous, frame.stamp_ns)` is its track.
 
         The first track of a run may be unseen, at any place, with a score of 0. It is the only memory: its score,
         radius_px and other fields, which people see, are the method's to use.
@@ -28,3 +29,8 @@ TRACKERS = Methods(
     group="flowrec.trackers",
     verb="track",
 )
+
+
+def unseen(previous: Track, stamp_ns: int) -> Track:
+    """The track after a frame that shows nothing new."""
+    return replace(previous, stamp_ns=stamp_ns, seen=False, lost_frames=previous.lost_frames + 1)

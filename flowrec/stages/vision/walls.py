@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -32,6 +33,14 @@ class Walls:
         return Walls(np.asarray(distance, np.float32), (left, top, right, bottom))
 
 
+def seen_walls(
+    chip: Chip, calibration: Calibration, shape: tuple[int, ...], shift_px: tuple[float, float]
+) -> tuple[Walls, Calibration]:
+    """Walls and calibration of an image that lies `shift_px` (columns, rows) from where the calibration holds."""
+    walls = walls_in_view(chip, calibration, shape)
+    return (walls.for_shift(shift_px), calibration.for_shift(shift_px)) if any(shift_px) else (walls, calibration)
+
+
 @lru_cache(maxsize=4)
 def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, ...]) -> Walls:
     """Walls of a chip in an image of `shape` (rows, columns); cached by the identity of the chip."""
@@ -53,6 +62,13 @@ def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, ...]) 
     across, down = np.flatnonzero(fluid.any(axis=0)), np.flatnonzero(fluid.any(axis=1))
     box = (int(across[0]), int(down[0]), int(across[-1]) + 1, int(down[-1]) + 1) if len(across) else (0, 0, 0, 0)
     return Walls(np.ascontiguousarray(distance, np.float32), box)
+
+
+def box_around(centre: tuple[float, float], range_px: float, box: Box) -> Box:
+    """The box of a range around a centre, cut off by the sides of another box."""
+    (x, y), (x0, y0, x1, y1) = centre, box
+    left, top = max(math.floor(x - range_px), x0), max(math.floor(y - range_px), y0)
+    return left, top, min(math.ceil(x + range_px) + 1, x1), min(math.ceil(y + range_px) + 1, y1)
 
 
 def _mask_distance_px(mask: Bools) -> Floats32:
