@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flowrec.core import JSON, M_PER_UM, MM_PER_UM, RBL, SAMPLES, Output
-from flowrec.store import LENGTHS, Session, SessionMetadata, files_behind, units_of
+from flowrec.store import LENGTHS, Session, SessionMetadata, files_behind
 from flowrec.view import APPLICATION, bare_blueprint, foxglove_layout, peak, plot_of, stream_plots
 
 _CAMERA = "/view/camera"
@@ -58,7 +58,7 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
         for topic in session.reader.topics.extra
         if topic.path != SAMPLES and (plot := plot_of(topic, next(session.messages(topic.path), None))) is not None
     ]
-    plots += stream_plots(units_of(session.reader))
+    plots += stream_plots(session.reader.stream_units)
     with SessionMetadata(session.run.files[0].path) as head:
         counts, began_ns = head.statistics.channel_message_counts, head.source.start_unix_ns
         present = {head.channels[number].topic for number, count in counts.items() if count}

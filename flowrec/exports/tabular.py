@@ -20,10 +20,10 @@ import pyarrow.compute
 import pyarrow.csv
 import pyarrow.parquet
 
-from flowrec.core import SessionError, __version__, seconds, summary_of
+from flowrec.core import SAMPLES, SessionError, __version__, seconds, summary_of
 from flowrec.exports.formats import TimeProgress
 from flowrec.stages import observations_of_others
-from flowrec.store import Session, field_values, has_streams, observed_flow, sample_batches, sample_schema
+from flowrec.store import Session, field_values, observed_flow, sample_batches, sample_schema
 
 _RUN = "^[=+\\-@\t\r'＝＋－＠]"  # what a text begins with that a spreadsheet may take for a formula
 _LEVEL = 1  # of zstd: a quarter of the time of level 3 for a tenth more bytes
@@ -73,7 +73,7 @@ class _Tables:
                 for batch in table.to_batches():
                     writer.write_batch(batch)
             resources.append(_resource(name + self.suffix, table.schema, meaning))
-        if has_streams(session.reader):
+        if SAMPLES in session.reader.topics.by_path:
             name, schema = "stream_samples" + self.suffix, sample_schema()
             with self.open_writer(part / name, schema) as writer:
                 for batch in sample_batches(session.reader):

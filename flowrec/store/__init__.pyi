@@ -41,9 +41,11 @@ from .signature import (
     refuse_unusable_key as refuse_unusable_key, sign_file as sign_file, signature_file as signature_file,
     verify_file as verify_file,
 )
-from .stream_samples import has_streams as has_streams, sample_batches as sample_batches, sample_schema as sample_schema, units_of as units_of
 from .table_columns import Column as Column, columns_of as columns_of, observations_of as observations_of
-from .tables import field_values as field_values, observed_flow as observed_flow
+from .tables import (
+    field_values as field_values, observed_flow as observed_flow, sample_batches as sample_batches,
+    sample_schema as sample_schema,
+)
 from .traffic import (
     HiddenError as HiddenError, MissingError as MissingError, RefusedError as RefusedError,
     TIMEOUT_KEY as TIMEOUT_KEY, TRAFFIC as TRAFFIC, TransientError as TransientError,

@@ -18,7 +18,15 @@ from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_format import MAGIC
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.recorder_process import MODULE
-from flowrec.store.run_files import PARTIAL_SUFFIX, part_number, part_path, partial_path, run_files, run_path
+from flowrec.store.run_files import (
+    complete_path,
+    part_number,
+    part_path,
+    partial_path,
+    run_files,
+    run_path,
+    unfinished_of,
+)
 from flowrec.store.scan import Scan, extent_of
 from flowrec.store.session_metadata import SessionHeader
 
@@ -59,10 +67,10 @@ class GrowingRun:
 
     def __init__(self, path: Path) -> None:
         self.path = run_path(path)
-        under_way = [file for file in run_files(self.path) if file.name.endswith(PARTIAL_SUFFIX) and is_growing(file)]
+        under_way = list(filter(is_growing, unfinished_of(self.path)))
         if not under_way:
             raise SessionError(f"{self.path}: is not being recorded; `flowrec ls --live` lists the runs that are")
-        self._file = _GrowingFile(under_way[-1].with_name(under_way[-1].name.removesuffix(PARTIAL_SUFFIX)))
+        self._file = _GrowingFile(complete_path(under_way[-1]))
         self._file.look()
         self._tick = Tick()
 

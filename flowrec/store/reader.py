@@ -6,14 +6,28 @@ import difflib
 import functools
 import itertools
 import operator
+from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import COILS, Closing, Frame, Ints, SessionError, Tick, array_shapes, seconds
+from flowrec.core import (
+    COILS,
+    NS_PER_S,
+    SAMPLES,
+    STREAMS,
+    Closing,
+    Floats,
+    Frame,
+    Ints,
+    SessionError,
+    Tick,
+    array_shapes,
+    seconds,
+)
 from flowrec.store.channels import Row
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.run_files import Run
@@ -21,6 +35,21 @@ from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.session_path import session_path
 
 _OPEN_FILES = 4  # of a run in parts, at a time
+
+
+class Channel(NamedTuple):
+    """The samples of a channel of a stream.
+
+    Attributes
+    ----------
+    time_s : (n,) when each was taken, on the session clock.
+    value : (n,) in `unit`.
+    unit : as the sender or the settings state it, '' where nobody does.
+    """
+
+    time_s: Floats
+    value: Floats
+    unit: str
 
 
 class SessionReader(Closing):
@@ -163,6 +192,27 @@ class SessionReader(Closing):
             for stamp_ns, message in file.messages(field):
                 if stamp_ns > keyframe_ns:
                     yield message
+
+    @functools.cached_property
+    def stream_units(self) -> dict[str, str]:
+        """Unit of each channel of a stream, by its name stream/channel."""
+        last = deque(self.messages(STREAMS) if STREAMS in self.topics.by_path else (), maxlen=1)
+        if not last or not last[0].channels:
+            return {}
+        return dict(zip(last[0].channel_names(), last[0].units.split("\n"), strict=True))
+
+    def channel(self, name: str) -> Channel:
+        """The samples of a channel of a stream. Raises SessionError: there is none of that name; it tells which are."""
+        names = list(self.stream_units)
+        if name not in names:
+            there = ", ".join(names[:12]) or "none: it was recorded without [streams.NAME]"
+            raise SessionError(f"{self.path}: no channel {name!r} of a stream; there are {there}")
+        times, values = [np.zeros(0, np.int64)], [np.zeros(0)]
+        for message in self.messages(SAMPLES):
+            mine = message.channel == names.index(name)
+            times.append(message.sample_ns[mine])
+            values.append(message.value[mine])
+        return Channel(np.concatenate(times) / NS_PER_S, np.concatenate(values), self.stream_units[name])
 
     def field_of(self, name: str) -> str:
         """The field of Tick of a topic, named by its field or by its path; SessionError if there is none."""

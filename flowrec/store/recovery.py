@@ -27,8 +27,9 @@ from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import disk_errors, new_mcap
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import (
-    PARTIAL_SUFFIX,
+    complete_path,
     is_continued,
+    is_partial,
     part_number,
     part_path,
     partial_path,
@@ -135,7 +136,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
             number = part_number(file)
             if number < 2 or number <= len(parts(path)):
                 raise
-            _rename(file, file.with_name(file.name.removesuffix(PARTIAL_SUFFIX) + _REMAINS_SUFFIX))
+            _rename(file, file.with_suffix(_REMAINS_SUFFIX))
     finished = parts(path)
     if finished:
         with SessionReader(finished[-1]) as last:
@@ -148,8 +149,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
 
 
 def _recover(path: Path, out: Path | None) -> Recovered:
-    partial = path.name.endswith(PARTIAL_SUFFIX)
-    final = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
+    partial, final = is_partial(path), complete_path(path)
     target = out or (final if partial else path.with_name(f"{path.stem}_recovered.mcap"))
     growing = partial_path(target)  # a run that will want the name at its end
     Output(target, MCAP, (path,), overwrite=True).check((growing,) if growing != path else ())
@@ -200,7 +200,7 @@ def _copy_intact(contents: SessionContents, draft: Path) -> Losses:
     with new_mcap(draft, overwrite=True) as out, disk_errors(draft):
         copier = ChunkCopier(contents, out, tally)
         found = scan(contents.source, copier.visit)
-        if not found.summary.chunks and path.name.endswith(PARTIAL_SUFFIX):
+        if not found.summary.chunks and is_partial(path):
             raise _nothing_on_disk(path)
         kept = tally.losses(found)
         if kept is None:

@@ -46,9 +46,20 @@ def partial_path(path: Path) -> Path:
     return path.with_name(path.name + PARTIAL_SUFFIX)
 
 
+def is_partial(path: Path) -> bool:
+    """True for the name of a file that is not complete."""
+    return path.name.endswith(PARTIAL_SUFFIX)
+
+
+def complete_path(path: Path) -> Path:
+    """The name of a file when it is complete."""
+    return path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
+
+
 def run_path(path: Path) -> Path:
     """X.mcap for any of its files, finished or not."""
-    complete, match = _match_name(path)
+    complete = complete_path(path)
+    match = _NUMBERED.fullmatch(complete.stem)
     return complete if match is None else complete.with_name(match["stem"] + complete.suffix)
 
 
@@ -107,20 +118,14 @@ def parts(path: Path) -> list[Path]:
 
 
 def _parts_among(files: Iterable[Path]) -> list[Path]:
-    finished = (file for file in files if part_number(file) and not file.name.endswith(PARTIAL_SUFFIX))
+    finished = (file for file in files if part_number(file) and not is_partial(file))
     return sorted(finished, key=part_number)
 
 
 def part_number(path: Path) -> int:
     """The number of a part of a run, finished or not, by its name; 0 for any other file."""
-    match = _match_name(path)[1]
+    match = _NUMBERED.fullmatch(complete_path(path).stem)
     return int(match["number"]) if match is not None and match["kind"] == "part" else 0
-
-
-def _match_name(path: Path) -> tuple[Path, re.Match[str] | None]:
-    """The file under its final name, and the parts of that name where it has a number."""
-    complete = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
-    return complete, _NUMBERED.fullmatch(complete.stem)
 
 
 def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
@@ -134,7 +139,7 @@ def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ())
     if overwrite:
         return
     for file in there:
-        if not file.name.endswith(PARTIAL_SUFFIX):
+        if not is_partial(file):
             raise name_taken(file)
         raise SessionError(
             f"{file}: is left from a run that did not finish; `flowrec recover {file}`"
@@ -238,7 +243,7 @@ def files_of(path: Path) -> list[Path]:
         return [path]
     files = run_files(path)
     found = _parts_among(files)
-    _refuse_unfinished(path, found, [file for file in files if file.name.endswith(PARTIAL_SUFFIX)])
+    _refuse_unfinished(path, found, list(filter(is_partial, files)))
     numbers = set(map(part_number, found))
     missing = min(set(range(1, max(numbers, default=0))) - numbers, default=None)
     if missing is not None:
@@ -251,7 +256,7 @@ def files_of(path: Path) -> list[Path]:
 
 def unfinished_of(path: Path) -> list[Path]:
     """The unfinished files of the run X.mcap: its single file, parts and snapshots."""
-    return [file for file in run_files(path) if file.name.endswith(PARTIAL_SUFFIX)]
+    return list(filter(is_partial, run_files(path)))
 
 
 def _refuse_unfinished(path: Path, found: Sequence[Path], partial: Sequence[Path]) -> None:

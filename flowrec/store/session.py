@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from flowrec.core import Event, FlowField, Tick
     from flowrec.physics import Calibration, Chip
     from flowrec.stages import ResolvedConfig
-    from flowrec.store.reader import Frames, SessionReader
-    from flowrec.store.stream_samples import Channel
+    from flowrec.store.reader import Channel, Frames, SessionReader
     from flowrec.store.tables import Tables
 
 _CARD_FIGURES = ("tracking_error_um", "contacts", "frames_dropped", "covered")  # that no sentence states
@@ -203,9 +202,7 @@ class Session(Closing):
 
     def stream(self, channel: str) -> Channel:
         """Samples of a channel of a stream, such as "pump/flow": `time_s`, `value`, `unit`; SessionError if none."""
-        from flowrec.store.stream_samples import channel_of
-
-        return channel_of(self.reader, channel)
+        return self.reader.channel(channel)
 
     def table(self, topic: str) -> pa.Table:
         """All messages of one topic as an Arrow table, one row a message; `.to_pandas()` makes a DataFrame of it.

@@ -1,4 +1,4 @@
-"""Rows of messages, flow fields and observations -> Arrow tables: typed columns whose metadata state unit and meaning.
+"""Messages, samples, flow fields and observations -> Arrow tables: typed columns whose metadata state unit and meaning.
 
 The rows come from `SessionReader.rows`. A batch has at most some thousand rows and some 8 MB, so a session of
 any length is streamed. https://arrow.apache.org/docs/python/data.html#record-batches
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from flowrec.core import (
     FIXED,
     NS_PER_S,
+    SAMPLES,
     VALUES,
     Bools,
     FlowField,
@@ -27,12 +28,14 @@ from flowrec.core import (
     unit_of,
     values_of,
 )
+from flowrec.store.reader import SessionReader
 from flowrec.store.table_columns import OBSERVED, STAMP, TIME, WALL, Column, columns_of
 
 with needs("a table", "export"):
     import pyarrow as pa
 
 _ROWS = 4096
+_SAMPLES = 1 << 16  # of a batch
 _BATCH_BYTES = 8 << 20  # an export holds some five times as much: columns, copies, and the pages of its writer
 
 
@@ -52,7 +55,7 @@ class Tables:
     def schema(self, topic: str) -> pa.Schema:
         """The Arrow schema of a topic's table; each field's metadata has `unit` and `meaning`, the table's `topic`."""
         fields = [
-            pa.field(column.name, _type_of(column), metadata={"unit": column.unit, "meaning": column.meaning})
+            _field(column.name, _type_of(column), column.unit, column.meaning)
             for column in columns_of(topic, self._topics, self._coils)
         ]
         return pa.schema(fields, metadata={"topic": self._topics.by_field[topic].path})
@@ -106,6 +109,10 @@ class Tables:
         return pa.RecordBatch.from_arrays(arrays, schema=self.schema(topic))
 
 
+def _field(name: str, kind: pa.DataType, unit: str, meaning: str) -> pa.Field:
+    return pa.field(name, kind, metadata={"unit": unit, "meaning": meaning})
+
+
 def _type_of(column: Column) -> pa.DataType:
     kind = pa.timestamp("ns", "UTC") if column.kind == "timestamp" else pa.type_for_alias(column.kind)
     for length in reversed(column.shape):
@@ -143,6 +150,48 @@ def _offsets(lengths: Ints) -> pa.Array:
     return pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
 
 
+def sample_schema() -> pa.Schema:
+    """The schema of `sample_batches`."""
+    return pa.schema(
+        [
+            _field("channel", pa.string(), "", "stream/channel"),
+            _field("unit", pa.string(), "", "of the value"),
+            _field("time_s", pa.float64(), "s", "when it was taken, on the session clock"),
+            _field("value", pa.float64(), "", "in that unit"),
+            _field("stamp_ns", pa.int64(), "ns", "stamp of the tick that took it"),
+        ]
+    )
+
+
+def sample_batches(reader: SessionReader) -> Iterator[pa.RecordBatch]:
+    """All samples of the streams of other programs, a row each, in order of arrival."""
+    names, units = (np.array(list(each), object) for each in (reader.stream_units, reader.stream_units.values()))
+    held: list[Any] = []
+    rows = 0
+
+    def batch() -> pa.RecordBatch:
+        channel = np.concatenate([each.channel for each in held])
+        stamps = np.repeat([each.stamp_ns for each in held], [len(each.value) for each in held])
+        columns = (
+            names[channel],
+            units[channel],
+            np.concatenate([each.sample_ns for each in held]) / NS_PER_S,
+            np.concatenate([each.value for each in held]),
+            stamps.astype(np.int64),
+        )
+        return pa.RecordBatch.from_arrays(list(map(pa.array, columns)), schema=sample_schema())
+
+    for message in reader.messages(SAMPLES):
+        held.append(message)
+        rows += len(message.value)
+        if rows >= _SAMPLES:
+            yield batch()
+            held.clear()
+            rows = 0
+    if held:
+        yield batch()
+
+
 def observed_flow(observations: Observations) -> pa.Table:
     """Observations with a row each, in the columns OBSERVED; what is not stated is empty."""
     rolled = (None, None) if observations.rolled_um_s is None else observations.rolled_um_s.T
@@ -158,10 +207,7 @@ def field_values(field: FlowField, fluid: Bools) -> pa.Table:
 
 def _table(meanings: Mapping[str, str], columns: Sequence[NDArray[Any] | None]) -> pa.Table:
     """A table of numbers; a column that is None is empty."""
-    fields = [
-        pa.field(name, pa.float64(), metadata={"unit": unit_of(name), "meaning": text})
-        for name, text in meanings.items()
-    ]
+    fields = [_field(name, pa.float64(), unit_of(name), text) for name, text in meanings.items()]
     missing = [None] * next(len(each) for each in columns if each is not None)
     arrays = [pa.array(missing if each is None else np.ascontiguousarray(each), pa.float64()) for each in columns]
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
