@@ -107,13 +107,13 @@ def law_oblique_case(name: str, width_px: float, k: int, angles_deg: tuple[float
 
 def _oblique(law: ViscosityLaw, width_px: float, angle_deg: float, k: int) -> float:
     """Relative error of the velocity in the middle of the channel, percent."""
-    chip, turned = oblique_channel(width_px, angle_deg, law=law)
+    chip, to_channel = oblique_channel(width_px, angle_deg, law=law)
     mask, angle = chip.mask, np.radians(angle_deg)
-    walls = from_distance(lambda x, y: 0.5 * width_px - np.abs(turned(x, y)[0]), mask.shape, k)
+    walls = from_distance(lambda x, y: 0.5 * width_px - np.abs(to_channel(x, y)[0]), mask.shape, k)
     equations = generalised_equations(chip, law, k, walls)
     flux = equations.steady(Scales.of(chip, k, False).drive, 0.0, 100, 1e-9)
     y, x = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(float)
-    across, along = turned(x, y)
+    across, along = to_channel(x, y)
     core = np.abs(along)[mask] < 15.0
     px = UM_PER_PX * M_PER_UM
     speed, _ = channel_profile(law, 0.5 * width_px * px, SPEED_UM_S * M_PER_UM, across[mask][core] * px)

@@ -32,19 +32,19 @@ def oblique_channel(
     angle, length = np.radians(angle_deg), 80
     rows = int(length * np.tan(angle)) + 24
 
-    def turned(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    def to_channel(x: Floats, y: Floats) -> tuple[Floats, Floats]:
         # Not symmetric to the pixels, as in a real image.
         x, y = x - 0.5 * (length - 1) + 0.13, y - 0.5 * (rows - 1) + 0.27
         return y * np.cos(angle) - x * np.sin(angle), x * np.cos(angle) + y * np.sin(angle)
 
     y, x = np.mgrid[:rows, :length].astype(float)
-    mask = np.abs(turned(x, y)[0]) < width_px / 2
+    mask = np.abs(to_channel(x, y)[0]) < width_px / 2
     left, right = np.flatnonzero(mask[:, 0]), np.flatnonzero(mask[:, -1])
     openings = (
         Opening("left", int(left[0]), int(left[-1]), "inlet", SPEED_UM_S * width_px / len(left)),
         Opening("right", int(right[0]), int(right[-1]), "outlet", 0.0),
     )
-    return Chip("oblique", mask, UM_PER_PX, openings, 1.0, 1000.0, walls=walls, law=law), turned
+    return Chip("oblique", mask, UM_PER_PX, openings, 1.0, 1000.0, walls=walls, law=law), to_channel
 
 
 def bend(law: ViscosityLaw | None = None) -> Chip:
@@ -148,10 +148,10 @@ def _slope_pa_m(width_px: float) -> float:
 
 def _oblique(width: float, angle_deg: float, k: int, walls: Walls) -> tuple[float, float]:
     """Relative error of the resistance of a channel across the mask, and how far the mask leaves it undetermined."""
-    chip, turned = oblique_channel(width, angle_deg, walls)
+    chip, to_channel = oblique_channel(width, angle_deg, walls)
     mask = chip.mask
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(float)
-    across, along = turned(columns, rows)
+    across, along = to_channel(columns, rows)
     pressure = FlowSolver(k).solve(chip).pressure_pa
     core = mask & (np.abs(across) < 1.0) & (np.abs(along) < 20.0)
     fall = -float(np.polyfit(along[core] * UM_PER_PX * 1e-6, pressure[core], 1)[0])

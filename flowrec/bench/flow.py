@@ -31,7 +31,7 @@ from flowrec.bench.harness import (
     vessel_cases,
 )
 from flowrec.bench.null_models import NULL_MODELS, NullModel
-from flowrec.bench.vessel_truth import read_observations, read_true_pressure, read_true_velocity
+from flowrec.bench.vessel_truth import Noise, ObservedShare, read_observations, read_true_pressure, read_true_velocity
 from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
 from flowrec.core import (
     FlowError,
@@ -89,8 +89,8 @@ def _check_subcells(k: int) -> int:
 def measure(
     cases: Cases = None,
     methods: Names = None,
-    noise: Annotated[Literal["00", "02", "05", "10"], typer.Option(help="Noise of the observations in %.")] = "05",
-    share: Annotated[Literal["05", "10", "20"], typer.Option(help="Observed part of the skeleton in %.")] = "10",
+    noise: Noise = "05",
+    share: ObservedShare = "10",
     k: Annotated[int, typer.Option("-k", callback=_check_subcells, help="Subcells per pixel side: 1, 2 or 4.")] = 2,
     outliers: Annotated[float, typer.Option(min=0, max=1, help="Share of the observations that are outliers.")] = 0.0,
     mask: Annotated[

@@ -115,11 +115,10 @@ def plan_paths(rows: Rows, figure: Figure) -> None:
         if mine:
             _show(ax, mine[0]["image"], mine[0]["image_width"], mine[0]["um_per_px"], "Greys")
         for row in mine:
-            x, y = (MM_PER_UM * np.asarray(row[f"trace_{axis}_um"]) for axis in "xy")
+            x, y = _in_mm(row, "trace")
             ax.plot(x, y, color=colour[row["planner"]], lw=0.9, label=f"{row['planner']} {row['time_s']:.1f} s")
         ax.set_title(label)
-        ax.legend(fontsize=5.5, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=1 if _is_narrow(figure) else 2)
-        style.bare(ax)
+        _legend_below(ax, figure)
 
 
 def tracking(rows: Rows, figure: Figure) -> None:
@@ -128,7 +127,7 @@ def tracking(rows: Rows, figure: Figure) -> None:
     shown = {law: found[0] for law, found in flown.items() if found}
     path, error = figure.subplots(2, 1, height_ratios=(1.2, 1.0)) if _is_narrow(figure) else figure.subplots(1, 2)
     for (law, row), colour in zip(shown.items(), (style.BLUE, style.VERMILLION, style.GREEN), strict=False):
-        x, y = (MM_PER_UM * np.asarray(row[f"trace_{axis}_um"]) for axis in "xy")
+        x, y = _in_mm(row, "trace")
         path.plot(x, y, color=colour, lw=0.8, label=_LAWS[law])
         path.plot(x[0], y[0], "o", ms=3, color=style.INK)
         time = np.asarray(row["trace_s"])
@@ -153,12 +152,11 @@ def mission_paths(rows: Rows, figure: Figure) -> None:
             shown = [row for row in select(rows, name, chip="bifurcation", way=way) if row.get("trace_x_um")]
             colour = colours(row["navigation"] for row in shown)
             for row in shown:
-                x, y = (MM_PER_UM * np.asarray(row[f"trace_{axis}_um"]) for axis in "xy")
+                x, y = _in_mm(row, "trace")
                 ended = f"{row['time_s']:.0f} s" if row["reached"] else row["outcome"]
                 ax.plot(x, y, color=colour[row["navigation"]], lw=0.9, label=f"{row['navigation']}: {ended}")
             ax.set_title(f"{known['world']}, {label}")
-            ax.legend(fontsize=5.5, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=1 if _is_narrow(figure) else 2)
-            style.bare(ax)
+            _legend_below(ax, figure)
 
 
 def mission_times(rows: Rows, figure: Figure) -> None:
@@ -195,7 +193,7 @@ def survey(rows: Rows, figure: Figure) -> None:
     for (time, seen, refined), row in zip(axes if not _is_narrow(figure) else np.transpose(axes), found, strict=True):
         time.plot(row["trace_s"], MM_PER_UM * np.asarray(row["trace_um_s"]), color=style.BLUE, lw=0.8)
         time.set(title=f"(a) {row['world']}: estimated", xlabel="time (s)", ylabel="speed (mm/s)")
-        x, y = (MM_PER_UM * np.asarray(row[f"seen_{axis}_um"]) for axis in "xy")
+        x, y = _in_mm(row, "seen")
         top = MM_PER_UM * row["top_um_s"]
         dots = seen.scatter(x, y, c=MM_PER_UM * np.asarray(row["seen_um_s"]), s=5, cmap=_SPEEDS, vmin=0.0, vmax=top)
         height, width = np.multiply(_pixels(row["image"], row["image_width"]).shape, MM_PER_UM * row["um_per_px"])
@@ -331,6 +329,18 @@ def _show(ax: Axes, image: Iterable[float], width: int, um_per_px: float = 0.0, 
 
 def _pixels(image: Iterable[float], width: int) -> Floats:
     return np.asarray(image, np.float64).reshape(-1, int(width))
+
+
+def _in_mm(row: Results, what: str) -> tuple[Floats, Floats]:
+    """X and y of a path of a row."""
+    x, y = (MM_PER_UM * np.asarray(row[f"{what}_{axis}_um"]) for axis in "xy")
+    return x, y
+
+
+def _legend_below(ax: Axes, figure: Figure) -> None:
+    """The legend of a map, which has no axes."""
+    ax.legend(fontsize=5.5, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=1 if _is_narrow(figure) else 2)
+    style.bare(ax)
 
 
 def _is_narrow(figure: Figure) -> bool:

@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from flowrec.bench.flow import make_up
 from flowrec.bench.harness import Cases, Names, Results, choose_names, print_rows, vessel_cases
-from flowrec.bench.vessel_truth import NOISES, read_observations, read_true_velocity
+from flowrec.bench.vessel_truth import NOISES, Noise, ObservedShare, read_observations, read_true_velocity
 from flowrec.bench.vessels import thin
 from flowrec.core import Floats, FlowError, FlowField, Observations, Route, nearest_pixels, progress, say
 from flowrec.physics import Chip, Doubts, FlowSolver, FlowUncertainty, relative_rmse, sample
@@ -30,6 +30,7 @@ from flowrec.stages import (
     SurveyOrder,
     SurveyPlanner,
     covariance_after,
+    length_um,
     load_config,
     resolve,
 )
@@ -89,7 +90,9 @@ def prior(task: SurveyCase) -> Seen:
 
 def _best(task: SurveyCase, places: Points) -> Points:
     """Greedy choice among places (n, 2): each next one lowers the predicted error of the map most."""
-    uncertainty = task.config.refine.uncertainty(task.assumed, _none(), task.chip, task.config.flow)
+    uncertainty = task.config.refine.uncertainty(
+        task.assumed, Observations(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)), task.chip, task.config.flow
+    )
     assert uncertainty is not None
     need, each = place_information(uncertainty, task.noise_um_s, task.chip, places)
     covariance, left, taken = uncertainty.covariance, list(range(len(places))), []
@@ -139,7 +142,7 @@ def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Se
             break
     if route is None:
         return Seen(np.zeros((0, 2)), reason=new.reason)
-    length = float(np.hypot(*np.diff(route.waypoints_um, axis=0).T).sum())
+    length = length_um(route)
     places = _along(route, length / max(task.count - 1, 1) * (1.0 - 1e-9))
     if choose:
         places = _best(task, _along(route, task.chip.um_per_px))
@@ -159,10 +162,6 @@ def _along(route: Route, spacing_um: float) -> Points:
     return np.column_stack([np.interp(at, length, route.waypoints_um[:, c]) for c in (0, 1)])
 
 
-def _none() -> Observations:
-    return Observations(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-
-
 _EXPLORE = SurveyPlanner(method="information", route_share=0.0)
 WAYS: dict[str, Callable[[SurveyCase], Seen]] = {
     "given": given_places,
@@ -179,8 +178,8 @@ WAYS: dict[str, Callable[[SurveyCase], Seen]] = {
 def measure(
     cases: Cases = None,
     ways: Names = None,
-    noise: Annotated[Literal["00", "02", "05", "10"], typer.Option(help="Noise of the observations in %.")] = "05",
-    share: Annotated[Literal["05", "10", "20"], typer.Option(help="Observed part of the skeleton in %.")] = "10",
+    noise: Noise = "05",
+    share: ObservedShare = "10",
     count: Annotated[int, typer.Option(min=1, help="Random cases, where no folder is given.")] = RANDOM_CASES,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 1,
     draws: Annotated[int, typer.Option(min=1, help="Draws of the noise per case; the error is their mean.")] = 4,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+import typer
 
 from flowrec.core import Floats, Observations
 from flowrec.physics import Chip, read_case
@@ -13,6 +15,8 @@ from flowrec.physics import Chip, read_case
 # Noise levels and shares of the skeleton that cases hold, by the names in their keys.
 NOISES = {"00": 0.0, "02": 0.02, "05": 0.05, "10": 0.1}
 SHARES = {"05": 0.05, "10": 0.1, "20": 0.2}
+Noise = Annotated[Literal["00", "02", "05", "10"], typer.Option(help="Noise of the observations in %.")]
+ObservedShare = Annotated[Literal["05", "10", "20"], typer.Option(help="Observed part of the skeleton in %.")]
 _HALVES, _MEANS = ("vx_c", "vy_c"), ("vx", "vy")
 
 

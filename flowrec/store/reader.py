@@ -199,7 +199,7 @@ class SessionReader(Closing):
         last = deque(self.messages(STREAMS) if STREAMS in self.topics.by_path else (), maxlen=1)
         if not last or not last[0].channels:
             return {}
-        return dict(zip(last[0].channel_names(), last[0].units.split("\n"), strict=True))
+        return dict(zip(last[0].channels.split("\n"), last[0].units.split("\n"), strict=True))
 
     def channel(self, name: str) -> Channel:
         """The samples of a channel of a stream. Raises SessionError: there is none of that name; it tells which are."""

@@ -91,9 +91,7 @@ ROUTE_FLOW = plot_schema(
 
 def robot_flow(robot: Estimate | Track, scene: ViewerScene) -> Payload:
     """The flow where the robot is."""
-    flow = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
-    numbers, _ = _beside_map(scene, scene.place_um(robot.position_um), flow)
-    return (ROBOT_FLOW.wire(**numbers, map_error_share=scene.map_error_share).SerializeToString(),)
+    return (ROBOT_FLOW.wire(**_of_robot(robot, scene), map_error_share=scene.map_error_share).SerializeToString(),)
 
 
 def flow_speed(robot: Estimate | Track, scene: ViewerScene) -> Payload:
@@ -103,8 +101,12 @@ def flow_speed(robot: Estimate | Track, scene: ViewerScene) -> Payload:
 
 def flow_difference(robot: Estimate | Track, scene: ViewerScene) -> Payload:
     """Length of the difference of the observer's flow and the map's."""
+    return _number(_of_robot(robot, scene)["difference_um_s"])
+
+
+def _of_robot(robot: Estimate | Track, scene: ViewerScene) -> dict[str, float]:
     flow = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
-    return _number(_beside_map(scene, scene.place_um(robot.position_um), flow)[0]["difference_um_s"])
+    return _beside_map(scene, scene.place_um(robot.position_um), flow)[0]
 
 
 def tracking_error(demand: Demand, _scene: ViewerScene) -> Payload:

@@ -36,6 +36,7 @@ from flowrec.stages import (
     Config,
     ResolvedConfig,
     config_from_tree,
+    length_um,
     registration_of,
     resolve,
 )
@@ -178,7 +179,7 @@ def _mission(config: ResolvedConfig, chip: Chip) -> _Rows:
     if not route.reachable:
         yield "mission", FAILURE, f"no route on the assumed flow: {route.reason}; choose another goal"
         return
-    length_mm = 1e-3 * float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
+    length_mm = 1e-3 * length_um(route)
     way = f"a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s" if length_mm else "back to the start"
     yield "mission", OK, f"{', '.join(mission.phases)}; {way}"
 

@@ -18,8 +18,8 @@ import math
 import numpy as np
 
 from flowrec.core import Floats, Floats32, FlowField, TracerTruth
-from flowrec.physics import Chip, median_width_um, walls_of
-from flowrec.rigs.simulated.bodies import carry, entry_um
+from flowrec.physics import Chip, median_width_um
+from flowrec.rigs.simulated.bodies import Carried
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.stages import Simulated
 
@@ -32,7 +32,7 @@ _STICKS_PER_S = 0.05  # rate at which a bead that lies on the floor sticks
 _G_M_S2 = 9.81  # standard gravity
 
 
-class Beads:
+class Beads(Carried):
     """`points_um` (n, 2), `radii_um` (n,) and `darkness` (n,) of the beads of a world.
 
     Parameters
@@ -52,15 +52,12 @@ class Beads:
         pump: Pump,
     ) -> None:
         count = simulated.tracers
-        self._rng = rng = np.random.default_rng([simulated.seed, _STREAM])
+        rng = np.random.default_rng([simulated.seed, _STREAM])
+        super().__init__(chip, field, clearance_um, rng)
         self.radii_um = robot_radius_um * rng.choice(_RADII, count)
         self.darkness = rng.uniform(*_DARKNESS, count)
-        rows, columns = np.nonzero(chip.mask & (clearance_um > _RADII[1] * robot_radius_um))
-        chosen = rng.integers(0, len(rows), count)
-        places = np.stack((columns[chosen], rows[chosen]), -1) + rng.uniform(-0.5, 0.5, (count, 2))
-        self.points_um = places * chip.um_per_px
-        self._chip, self._field, self._clearance, self._pump = chip, field, clearance_um, pump
-        self._inlets = [opening for opening in chip.openings if opening.kind == "inlet"]
+        self._scatter(count, _RADII[1] * robot_radius_um)
+        self._pump = pump
         self._depth_um = depth_um
         self._exponent = 0.0 if depth_um is None else profile_exponent(depth_um / median_width_um(chip))
         room = 0.5 if depth_um is None else np.minimum(_TOUCH * self.radii_um / depth_um, 0.5)
@@ -71,7 +68,6 @@ class Beads:
         self._velocity_um_s = np.zeros((count, 2))
         settles = 2.0 / 9.0 * simulated.tracer_excess_kg_m3 * _G_M_S2 / (1e-3 * field.viscosity_mpa_s)
         self._settling_um_s = settles * (1e-6 * self.radii_um) ** 2 * 1e6
-        self._lost = np.zeros(count, np.bool_)
 
     def speed_share(self) -> Floats:
         """(n,) speed of each bead over the mean of the flow over the depth."""
@@ -86,16 +82,7 @@ class Beads:
         """Move all by dt; a bead that has left the chip comes in again as another one."""
         before = self.points_um.copy()
         strength = self._pump.strength(self._time_s + 0.5 * dt_s)
-        carry(
-            self.points_um,
-            strength * self.speed_share(),
-            self._field.velocity_um_s,
-            walls_of(self._field),
-            self._clearance,
-            self._chip.um_per_px,
-            dt_s,
-            self._lost,
-        )
+        left = self._carry(strength * self.speed_share(), dt_s)
         self._time_s += dt_s
         if dt_s > 0.0:
             self._velocity_um_s = (self.points_um - before) / dt_s
@@ -105,12 +92,12 @@ class Beads:
             self._height = np.clip(lower, least, 1.0 - least)
             lies = self._height <= least
             self._stuck |= lies & (self._rng.random(len(lies)) < -math.expm1(-_STICKS_PER_S * dt_s))
-        for n in np.flatnonzero(self._lost).tolist():
-            self.points_um[n] = entry_um(self._chip, self._inlets, self._rng)
+        for n in left:
             self._enter(n)
 
     def _enter(self, n: int) -> None:
         """Another bead in place of one: as many come in at each height as flow through there."""
+        super()._enter(n)
         self._id[n] = self._id.max() + 1.0
         self._stuck[n] = False
         self._velocity_um_s[n] = 0.0

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from flowrec.core import UM_PER_M, Bools, Floats, Floats32, FlowField, bilinear, compiled
-from flowrec.physics import Chip, Opening, Robot, sample, velocity_at, walls_of
+from flowrec.physics import Chip, Robot, sample, velocity_at, walls_of
 from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Hindrance, hindered_velocity
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.world import true_pump
@@ -236,64 +236,69 @@ def carry(
         lost[n] = not (-0.5 <= i <= width - 0.5 and -0.5 <= j <= height - 0.5) or bilinear(clearance, i, j) < 0.0
 
 
-class Debris:
-    """`points_um` (n, 2), `radii_um` (n,) and `darkness` (n,) from 0 to 1; the last `still` of them never move."""
+class Carried:
+    """Bodies that the flow carries: `points_um` (n, 2). One that has left the chip comes in again at an inlet."""
 
-    def __init__(
-        self,
-        chip: Chip,
-        count: int,
-        robot_radius_um: float,
-        field: FlowField,
-        clearance_um: Floats32,
-        seed: int,
-    ) -> None:
-        self._rng = np.random.default_rng([seed, 2])
-        self.still = count // 6
-        total = count + self.still
-        self.radii_um = robot_radius_um * self._rng.uniform(0.3, 0.7, total)
-        self.darkness = self._rng.uniform(0.15, 0.45, total)
-        # Room for the largest particle: one that overlaps a wall would look wrong.
-        rows, columns = np.nonzero(chip.mask & (clearance_um > 0.7 * robot_radius_um))
+    points_um: Floats
+
+    def __init__(self, chip: Chip, field: FlowField, clearance_um: Floats32, rng: np.random.Generator) -> None:
+        self._chip, self._field, self._clearance, self._rng = chip, field, clearance_um, rng
+        self._inlets = [opening for opening in chip.openings if opening.kind == "inlet"]
+
+    def _scatter(self, count: int, room_um: float) -> None:
+        """Draw their first places, with room for the largest: one that overlaps a wall would look wrong."""
+        rows, columns = np.nonzero(self._chip.mask & (self._clearance > room_um))
         if not len(rows):
-            rows, columns = np.nonzero(chip.mask)
-        chosen = self._rng.integers(0, len(rows), total)
-        places = np.stack((columns[chosen], rows[chosen]), -1) + self._rng.uniform(-0.5, 0.5, (total, 2))
-        self.points_um = places * chip.um_per_px
-        self._chip = chip
-        self._inlets = [o for o in chip.openings if o.kind == "inlet"]
-        self._field = field
-        self._clearance = clearance_um
-        self._lost = np.zeros(count, np.bool_)
-        self._whole = np.ones(count)
+            rows, columns = np.nonzero(self._chip.mask)
+        chosen = self._rng.integers(0, len(rows), count)
+        places = np.stack((columns[chosen], rows[chosen]), -1) + self._rng.uniform(-0.5, 0.5, (count, 2))
+        self.points_um = places * self._chip.um_per_px
 
-    def drift(self, dt_s: float) -> None:
-        """Move all by dt; a particle that has left the chip enters again at an inlet."""
-        moving = len(self.points_um) - self.still
+    def _carry(self, share: Floats, dt_s: float) -> list[int]:
+        """Move the first n of them by dt, each with its share (n,) of the flow; numbers of those that have left."""
+        lost = np.zeros(len(share), np.bool_)
         carry(
-            self.points_um[:moving],
-            self._whole,
+            self.points_um[: len(share)],
+            share,
             self._field.velocity_um_s,
             walls_of(self._field),
             self._clearance,
             self._chip.um_per_px,
             dt_s,
-            self._lost,
+            lost,
         )
-        for n in np.flatnonzero(self._lost).tolist():
-            self.points_um[n] = entry_um(self._chip, self._inlets, self._rng)
+        return np.flatnonzero(lost).tolist()
+
+    def _enter(self, n: int) -> None:
+        """Let one come in at a drawn place: more enter where the inflow is faster."""
+        inlet = self._inlets[int(self._rng.integers(len(self._inlets)))]
+        # The mean of three uniform draws is nearly a parabola.
+        along = inlet.first + (inlet.width_px - 1) * float(self._rng.random(3).mean())
+        height, width = self._chip.mask.shape
+        place = {
+            "left": (0.0, along),
+            "right": (width - 1.0, along),
+            "top": (along, 0.0),
+            "bottom": (along, height - 1.0),
+        }[inlet.side]
+        self.points_um[n] = np.array(place) * self._chip.um_per_px
 
 
-def entry_um(chip: Chip, inlets: list[Opening], rng: np.random.Generator) -> Floats:
-    """A drawn place (2,) at which a particle comes in: more enter where the inflow is faster."""
-    inlet = inlets[int(rng.integers(len(inlets)))]
-    # The mean of three uniform draws is nearly a parabola.
-    along = inlet.first + (inlet.width_px - 1) * float(rng.random(3).mean())
-    height, width = chip.mask.shape
-    place = {
-        "left": (0.0, along),
-        "right": (width - 1.0, along),
-        "top": (along, 0.0),
-        "bottom": (along, height - 1.0),
-    }[inlet.side]
-    return np.array(place) * chip.um_per_px
+class Debris(Carried):
+    """`points_um` (n, 2), `radii_um` (n,) and `darkness` (n,) from 0 to 1; the last `still` of them never move."""
+
+    def __init__(
+        self, chip: Chip, count: int, robot_radius_um: float, field: FlowField, clearance_um: Floats32, seed: int
+    ) -> None:
+        super().__init__(chip, field, clearance_um, np.random.default_rng([seed, 2]))
+        self.still = count // 6
+        total = count + self.still
+        self.radii_um = robot_radius_um * self._rng.uniform(0.3, 0.7, total)
+        self.darkness = self._rng.uniform(0.15, 0.45, total)
+        self._scatter(total, 0.7 * robot_radius_um)
+        self._whole = np.ones(count)
+
+    def drift(self, dt_s: float) -> None:
+        """Move all by dt."""
+        for n in self._carry(self._whole, dt_s):
+            self._enter(n)
