@@ -70,7 +70,7 @@ def draw_plan(path: Path, examples: list[tuple[TripCase, Trip, dict[str, Route]]
         ax.imshow(np.where(mask, speed, np.nan), cmap="Greys_r", vmin=0, vmax=1)
         for method, route in reversed(routes.items()):  # time_field on top
             if route.reachable:
-                label = f"{method} {route.arrival_s[-1]:.1f} s"
+                label = f"{method} {route.lasts_s:.1f} s"
                 ax.plot(*(route.waypoints_um / px).T, color=colour[method], linewidth=1.4, label=label)
         for point, marker in ((trip.lower_um, "o"), (trip.upper_um, "*")):
             ax.plot(*(point / px), marker, color=INK, markersize=7, markerfacecolor="white")

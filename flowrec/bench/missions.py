@@ -286,7 +286,7 @@ def fly(
     taken_s = best_s = planned_s = None
     if log.began is not None:
         began_ns, start_um, route = log.began
-        planned_s = float(route.arrival_s[-1])
+        planned_s = route.lasts_s
         tolerance_um = config.mission.goal_tolerance_um or config.robot.radius_um
         able = able_robot(config.robot, config.simulated)
         best_s = optimum_s(truth, start_um, mission.goal_um, tolerance_um, chip, able)

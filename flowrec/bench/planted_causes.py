@@ -65,7 +65,7 @@ def _of_the_camera(config: ResolvedConfig, chip: Chip) -> Iterator[str]:
         clockwise = (turned_deg > 0.0) != stated.mirror
         yield f"the chip is turned by .* degrees {'' if clockwise else 'counter'}clockwise"
         yield _MOVED
-    middle_px = 0.5 * (np.array([camera.width_px, camera.height_px]) - 1.0)
+    middle_px = 0.5 * (np.array(camera.size_px) - 1.0)
     x, y = stated.to_um(middle_px) - true.to_um(middle_px)  # where the registration puts the chip: short by this
     size = float(np.hypot(x, y))
     if size > _OFFSET_PX * chip.um_per_px:

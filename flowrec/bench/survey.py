@@ -128,7 +128,7 @@ def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Se
     observed = task.observe(np.zeros((0, 2)))
     for _ in range(_MOST_STRETCHES):
         uncertainty = config.refine.uncertainty(task.assumed, observed, task.chip, config.flow)
-        ends = 0.0 if route is None else float(route.arrival_s[-1])
+        ends = 0.0 if route is None else route.lasts_s
         order = SurveyOrder(
             *(task.assumed, start, task.chip, config.robot, np.array(config.mission.goal)),
             *(uncertainty, sampling, observed, route, ends),
@@ -146,7 +146,7 @@ def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Se
     places = _along(route, length / max(task.count - 1, 1) * (1.0 - 1e-9))
     if choose:
         places = _best(task, _along(route, task.chip.um_per_px))
-    return Seen(places[: task.count], float(route.arrival_s[-1]), route.reason)
+    return Seen(places[: task.count], route.lasts_s, route.reason)
 
 
 def _extend_observations(before: Observations, now: Observations) -> Observations:
@@ -238,7 +238,7 @@ def survey_rows(path: Path, names: Sequence[str], noise: str, share: str, draws:
 def crossing_s(config: ResolvedConfig, chip: Any, assumed: FlowField) -> float | None:
     """The planned time from start to goal in the assumed flow."""
     route = config.plan.plan(assumed, config.mission.start, config.mission.goal, chip, config.robot)
-    return float(route.arrival_s[-1]) if route.reachable else None
+    return route.lasts_s if route.reachable else None
 
 
 def resolve_case(path: Path) -> tuple[ResolvedConfig, Any]:

@@ -75,7 +75,7 @@ class Given:
     def shifted_um(self, pixels: float) -> str:
         """The centre of the image, shifted by camera pixels in any direction, as a setting."""
         camera, angle = self.config.camera, self.rng.uniform(0.0, 2.0 * math.pi)
-        middle = 0.5 * (np.array([camera.width_px, camera.height_px]) - 1.0)
+        middle = 0.5 * (np.array(camera.size_px) - 1.0)
         place = middle + pixels * np.array([math.cos(angle), math.sin(angle)])
         x, y = calibration_of(self.config, self.chip).to_um(place)
         return f"[{x:.3f}, {y:.3f}]"

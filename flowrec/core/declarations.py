@@ -191,6 +191,8 @@ class Message:
 
     __slots__ = ()
 
+    stamp_ns: int
+
     def __post_init__(self) -> None:
         for name, dtype in array_fields(type(self)):
             given = getattr(self, name)
@@ -210,6 +212,10 @@ class Message:
             value = getattr(self, name)
             if value is not None and not _is_finite(value):
                 raise NotFiniteError(_refusal(self))
+
+    def since_s(self, earlier: Message | None) -> float:
+        """Time in s from the stamp of an earlier record to that of this one; 0 where there is none."""
+        return 0.0 if earlier is None else seconds(self.stamp_ns - earlier.stamp_ns)
 
     def same_as(self, other: object) -> bool:
         """True if the other record is the same bit for bit (NaN equals NaN)."""
@@ -245,7 +251,7 @@ def _refusal(message: Message) -> str:
         value = np.asarray(getattr(message, name))
         wrong = value.size - int(np.count_nonzero(np.isfinite(value)))
         said.append(name if value.ndim == 0 else f"{name} ({wrong} of {value.size} numbers)")
-    at_s = seconds(message.stamp_ns)  # type: ignore[attr-defined]
+    at_s = seconds(message.stamp_ns)
     return (
         f"{type(message).__name__} at {at_s:.3f} s refused: NaN or infinity in {', '.join(said)}; look at the settings "
         "and the inputs that it was made from"

@@ -9,7 +9,7 @@ import dataclasses
 import types
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, get_args, get_type_hints
+from typing import Annotated, TypeVar, get_args, get_type_hints
 
 from flowrec.core.declarations import Message, SlowStage, Source, Topic, message_fields
 from flowrec.core.diagnostics import CameraLosses, Clocks, Drops, Timing
@@ -59,6 +59,9 @@ _PLAN = SlowStage(
 )
 
 
+Kind = TypeVar("Kind", bound=Message)
+
+
 class Extra(Mapping[str, Message]):
     """The latest message of each topic that is no field of `Tick`, by path; read-only."""
 
@@ -81,6 +84,11 @@ class Extra(Mapping[str, Message]):
 
     def __repr__(self) -> str:
         return f"Extra({self._messages!r})"
+
+    def of(self, path: str, kind: type[Kind]) -> Kind | None:
+        """The message of a topic; None where there is none of this kind."""
+        found = self._messages.get(path)
+        return found if isinstance(found, kind) else None
 
     def with_messages(self, new: Mapping[str, Message]) -> Extra:
         """These messages and newer ones; itself if there is none."""

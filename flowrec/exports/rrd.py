@@ -135,7 +135,7 @@ def scene_of(config: ResolvedConfig, chip: Chip, path: Path) -> Scene:
         path.stem,
         properties,
         windows=windows,
-        camera_shape=(config.camera.height_px, config.camera.width_px),
+        camera_shape=config.camera.shape,
     )
 
 

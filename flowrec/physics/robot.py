@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import Applied, Floats, FlowField, PositiveShare, Range, UsageError, seconds
+from flowrec.core import Applied, Floats, FlowField, PositiveShare, Range, UsageError
 
 _SIGNIFICANT = 2.0  # standard deviations
 _NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are meant for
@@ -100,7 +100,7 @@ class Robot(RobotSettings):
         """
         if not self.speed_at_hz or before is None or applied.stamp_ns <= before.stamp_ns:
             return applied
-        mean_hz = math.hypot(*applied.turns) / seconds(applied.stamp_ns - before.stamp_ns)
+        mean_hz = math.hypot(*applied.turns) / applied.since_s(before)
         return replace(applied, turns=self.proportional_hz(mean_hz) / mean_hz * applied.turns) if mean_hz else applied
 
     def _with_response(self, table: tuple[tuple[float, float], ...], changed: Callable[[float], float]) -> Robot:

@@ -48,7 +48,7 @@ def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
     if present is not None:
         progress_s = order.demand.progress_s if order.demand is not None else 0.0
         spent_s = seconds(order.stamp_ns - mission.since_ns - mission.held_ns)
-        left_s -= spent_s + float(present.arrival_s[-1]) - progress_s
+        left_s -= spent_s + present.lasts_s - progress_s
     return pipeline.survey.plan(
         SurveyOrder(
             field,

@@ -303,7 +303,7 @@ def registration_of(camera: ResolvedCamera, chip: Chip) -> Calibration:
     width_um, height_um = chip.size_um
     half = 0.5 * chip.um_per_px
     middle = (width_um / 2 - half, height_um / 2 - half) if camera.centre_um is None else camera.centre_um
-    size_px = (camera.width_px, camera.height_px)
+    size_px = camera.size_px
     return Calibration.centre_on(camera.um_per_px, middle, size_px, camera.angle_deg, camera.mirror)
 
 

@@ -72,8 +72,8 @@ class OtherRobots:
         pump : makes observations, given those before, to observations of the pump's nominal flow.
         """
         made: dict[str, Observations] = {}
-        told = last.extra.get(WALLS)
-        if not self.observe_flow or not isinstance(told, RobotWalls):
+        told = last.extra.of(WALLS, RobotWalls)
+        if not self.observe_flow or told is None:
             return made
         known = observations_of_others(last)
         free = np.isfinite(walls.wall_um) & (walls.near == 0.0) & np.isfinite(told.wall_um) & (told.near == 0.0)
@@ -106,9 +106,8 @@ class OtherRobots:
         radii_um : of each of them.
         clearance_um : (h, w) from each pixel centre of the chip to the nearest wall.
         """
-        before, demand = last.extra.get(WALLS), last.demand
+        told, demand = last.extra.of(WALLS, RobotWalls), last.demand
         near_um = 0.5 * robot.radius_um if self.near_um is None else self.near_um
-        told = before if isinstance(before, RobotWalls) else None
         rows = []
         for number, (track, estimate) in enumerate(zip(tracks, estimates, strict=True)):
             was_near = told is not None and bool(told.near[number])
@@ -128,7 +127,7 @@ def _with_unknown_response(made: Observations, past: Estimate, now: Estimate, ro
     The robot follows the field later than the first one, by an unknown time of the order of the first one's delay:
     while its mean own motion changes, that time is a velocity. And its speed is not in proportion to the frequency.
     """
-    dt = seconds(now.stamp_ns - past.stamp_ns)
+    dt = now.since_s(past)
     if not past.rolled_um_s.size or dt <= 0.0:
         return made
     late_um_s = robot.delay_s * math.hypot(*(now.rolled_um_s - past.rolled_um_s)) / dt

@@ -103,7 +103,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
         robot=config.robot.proportional(),
         response=config.robot,
         clearance_um=clearance_um(chip.mask, chip.um_per_px),
-        image_shape=(config.camera.height_px, config.camera.width_px),
+        image_shape=config.camera.shape,
         image_bits=config.camera.bits,
         stabiliser=config.stabilise,
         tracker=config.tracker,

@@ -72,6 +72,16 @@ class CameraSettings:
     # exposure time of an image; the robot is where it was in the middle of that time
     exposure_s: Annotated[float, Range(0.0, 10.0)] = 0.004
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of an image."""
+        return self.width_px, self.height_px
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of an image."""
+        return self.height_px, self.width_px
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResolvedCamera(CameraSettings):

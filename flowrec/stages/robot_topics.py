@@ -44,14 +44,12 @@ def _of(topic: Topic, number: int) -> Topic:
 
 def track_of(tick: Tick, number: int) -> Track | None:
     """The latest track of a robot."""
-    message = tick.track if number == 0 else tick.extra.get(robot_topic(_TRACK, number))
-    return message if isinstance(message, Track) else None
+    return tick.track if number == 0 else tick.extra.of(robot_topic(_TRACK, number), Track)
 
 
 def estimate_of(tick: Tick, number: int) -> Estimate | None:
     """The latest estimate of a robot."""
-    message = tick.estimate if number == 0 else tick.extra.get(robot_topic(_ESTIMATE, number))
-    return message if isinstance(message, Estimate) else None
+    return tick.estimate if number == 0 else tick.extra.of(robot_topic(_ESTIMATE, number), Estimate)
 
 
 def observations_of_others(tick: Tick) -> dict[int, Observations]:

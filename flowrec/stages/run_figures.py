@@ -59,8 +59,8 @@ class RobotStatistics:
         if track.stamp_ns == tick.stamp_ns:
             self._images += 1
             self._seen += track.seen
-        walls = tick.extra.get(WALLS)
-        if isinstance(walls, RobotWalls) and self._number <= len(walls.near):
+        walls = tick.extra.of(WALLS, RobotWalls)
+        if walls is not None and self._number <= len(walls.near):
             near = bool(walls.near[self._number - 1])
             self._alarms += near and not self._was_near
             self._was_near = near
@@ -70,11 +70,10 @@ class RobotStatistics:
             truths = {path: each for path, each in tick.extra.items() if isinstance(each, Truth)}
             off_um = {path: math.dist(each.position_um, track.position_um) for path, each in truths.items()}
             self._true = min(off_um, key=lambda path: off_um[path], default="")
-        truth = tick.extra.get(self._true)
-        if isinstance(truth, Truth):
+        if (truth := tick.extra.of(self._true, Truth)) is not None:
             self._contacts = truth.contacts
-        observations = tick.extra.get(observations_topic(self._number))
-        if isinstance(observations, Observations):
+        observations = tick.extra.of(observations_topic(self._number), Observations)
+        if observations is not None:
             self._observations = len(observations.std_um_s)
 
     @property
@@ -177,7 +176,7 @@ def figures_of(
     if mission is not None and route is not None and route.reachable and flies and route.method != SURVEY_ROUTE:
         figures["planner"] = route.method
         figures["route_length_um"] = length_um(route)
-        figures["planned_s"] = float(route.arrival_s[-1])
+        figures["planned_s"] = route.lasts_s
         if mission.outcome == Outcome.REACHED and navigating_ns is not None:
             figures["navigation_s"] = seconds(mission.since_ns - navigating_ns)
     if mission is not None and mission.goal_set_ns is not None:
@@ -223,7 +222,7 @@ def shortest_way(last: Tick, planner: Planner, chip: Chip, robot: Robot) -> Figu
     shortest = by_length.plan(last.field, route.waypoints_um[0], mission.goal_um, chip, robot_at(last, mission, robot))
     if not shortest.reachable:
         return {"shortest_way_s": None}
-    return {"shortest_way_um": length_um(shortest), "shortest_way_s": float(shortest.arrival_s[-1])}
+    return {"shortest_way_um": length_um(shortest), "shortest_way_s": shortest.lasts_s}
 
 
 def length_um(route: Route) -> float:

@@ -144,7 +144,7 @@ def region_of(config: ResolvedConfig, chip: Chip, again: bool = False) -> Region
     recording, camera = config.recording, config.camera
     if recording.region == "whole":
         return None
-    shape = (camera.height_px, camera.width_px)
+    shape = camera.shape
     footprint = config.tracker.footprint(chip, calibration_of(config, chip), config.robot, shape)
     pad_px = footprint.pad_px + recording.region_pad_px
     return Region(pad_px, footprint.everywhere_px, recording.full_every_s, cut=not again)

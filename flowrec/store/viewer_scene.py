@@ -137,7 +137,7 @@ class ChipCamera:
             calibration = calibration_of(config, header.chip())
         except FlowrecError:
             return None
-        return cls(calibration, (config.camera.width_px, config.camera.height_px), config.robot.radius_um)
+        return cls(calibration, config.camera.size_px, config.robot.radius_um)
 
     def picture(self, registration: Matrix | None, shift: Shift | None = None) -> Picture:
         """The camera's image on the chip, by the registration that a refinement found and the shift of the image."""

@@ -36,7 +36,6 @@ from flowrec.core import (
     nanoseconds,
     realtime_priority,
     say,
-    seconds,
     temporary_name,
     warn,
 )
@@ -197,7 +196,7 @@ def _trial(
         time.sleep(_POLL_S)
     written_s = max(time.monotonic() - _SETTLE_S, ticked_s) - begin_s
     waiting = min(writer.queue_bytes / max(latest.image.nbytes, 1), ticks)
-    asked_hz = (latest.index - first.index) / seconds(latest.stamp_ns - first.stamp_ns)
+    asked_hz = (latest.index - first.index) / latest.since_s(first)
     # One image less than the ticks: the time begins with the first.
     written = ticks - 1 - writer.dropped_frames - waiting
     return Held(asked_hz, (ticks - 1) / (ticked_s - begin_s), written / written_s, granted)

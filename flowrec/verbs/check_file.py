@@ -68,7 +68,7 @@ class FileCheck:
             if header is not None:
                 config = self._config = config_from_toml(header.config_toml, "its configuration", header.provenance)
                 chip = chip_from_files(header.chip_png, header.chip_toml, "its chip")
-                shape = config.camera.height_px, config.camera.width_px
+                shape = config.camera.shape
                 quality = TrackQuality(calibration_of(config, chip), shape, config.robot)
         except FlowrecError as error:
             self._head_fault = str(error)

@@ -161,7 +161,7 @@ def _settings(asked: Config) -> Generator[_Row, None, tuple[ResolvedConfig, Chip
 
 def _view(config: ResolvedConfig, chip: Chip) -> Iterator[_Row]:
     """Compare what the camera sees with the chip, of which a mission that observes may see a part."""
-    seen_um = config.camera.um_per_px * np.array([config.camera.width_px, config.camera.height_px])
+    seen_um = config.camera.um_per_px * np.array(config.camera.size_px)
     if (np.sort(chip.size_um) > _SEES_ALL * np.sort(seen_um)).any():
         view, whole = (" x ".join(f"{1e-3 * side:.3g}" for side in each) for each in (seen_um, chip.size_um))
         text, observes = f"the image shows {view} mm of a chip of {whole} mm", config.mission.observes
@@ -180,7 +180,7 @@ def _mission(config: ResolvedConfig, chip: Chip) -> _Rows:
         yield "mission", FAILURE, f"no route on the assumed flow: {route.reason}; choose another goal"
         return
     length_mm = 1e-3 * length_um(route)
-    way = f"a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s" if length_mm else "back to the start"
+    way = f"a route of {length_mm:.2f} mm in {route.lasts_s:.1f} s" if length_mm else "back to the start"
     yield "mission", OK, f"{', '.join(mission.phases)}; {way}"
 
 
@@ -206,7 +206,7 @@ def _camera(config: ResolvedConfig, chip: Chip | None) -> _Rows:
     info = seen.info
     name = " ".join(filter(None, (info.model, info.serial)))
     yield "camera", OK, f"{name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}"
-    if (info.width_px, info.height_px, info.bits) != (camera.width_px, camera.height_px, camera.bits):
+    if (info.width_px, info.height_px, info.bits) != (*camera.size_px, camera.bits):
         yield (
             "camera",
             FAILURE,
@@ -236,7 +236,7 @@ def _camera(config: ResolvedConfig, chip: Chip | None) -> _Rows:
         yield "image", WARNING, text
     else:
         yield "image", OK, f"brightest pixel {seen.brightest} of {full}"
-    if chip is not None and seen.image is not None and seen.image.shape == (camera.height_px, camera.width_px):
+    if chip is not None and seen.image is not None and seen.image.shape == camera.shape:
         yield from _walls(config, chip, seen.image)
 
 

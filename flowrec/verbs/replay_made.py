@@ -148,4 +148,4 @@ def _navigation_s(flight: RunReport) -> float | None:
 
 def _planned_s(flight: RunReport) -> float | None:
     route = flight.last.route
-    return float(route.arrival_s[-1]) if route is not None and len(route.arrival_s) else None
+    return route.lasts_s if route is not None and len(route.arrival_s) else None

@@ -118,7 +118,7 @@ class Tally:
         """Count one message: its field of Tick, the time of its tick in ns, itself."""
         for wrong in invalid_numbers(message):
             self.not_finite[f"{self._topics.by_field[name].path} {wrong}"] += 1
-        self.latest_ns[name] = stamp_ns = message.stamp_ns  # type: ignore[attr-defined]
+        self.latest_ns[name] = stamp_ns = message.stamp_ns
         if log_ns != self._judged_ns:
             self._judge_track()
             self._judged_ns = log_ns

@@ -53,7 +53,7 @@ class Watching:
             say(self._live.message)
         if obey is not None:
             camera = scene[0].camera
-            shown = replace(shown, image_px=(camera.width_px, camera.height_px))
+            shown = replace(shown, image_px=camera.size_px)
             port = self._live.port if self._live.pid is not None else None
             self._console = Console(obey, shown, scene[2].name, port, remarks, say)
             say(self._console.message)

@@ -295,3 +295,8 @@ class Route(Message):
         "Why this is the route that was in use before, or none, and not the result of the order. '': it is that "
         "result.",
     ] = ""
+
+    @property
+    def lasts_s(self) -> float:
+        """Time from its first point to its last one; IndexError of a route without points."""
+        return float(self.arrival_s[-1])

@@ -44,7 +44,7 @@ class ReportData:
         Raises FlowrecError: header, chip or a message is not valid.
         """
         config = session.config
-        size_px = (config.camera.width_px, config.camera.height_px)
+        size_px = config.camera.size_px
         scene = Scene(session.chip, session.calibration, config.robot, session.path.stem, image_px=size_px)
         data = cls(session, scene, History.of(session, progress), picture_of(session))
         for name, field in (("assumed", data.assumed), ("refined", data.refined), ("true", data.truth)):

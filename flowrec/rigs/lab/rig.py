@@ -206,7 +206,7 @@ class LabRig:
     def _check(self, info: CameraInfo) -> None:
         """Refuse a camera that delivers other images than configured."""
         camera = self._config.camera
-        if (info.width_px, info.height_px) != (camera.width_px, camera.height_px):
+        if (info.width_px, info.height_px) != camera.size_px:
             raise RigError(
                 f"{info.name}: images of {info.width_px} x {info.height_px} pixels, where camera.width_px x "
                 f"camera.height_px = {camera.width_px} x {camera.height_px}; set them to what the camera can deliver"

@@ -141,9 +141,7 @@ class Microscope:
         self._calibration = calibration
         self._noise = np.random.default_rng([seed, 4])
         self._pool = np.clip(np.rint(self._noise.standard_normal(_POOL) * _NOISE_STEPS), -127, 127).astype(np.int8)
-        self._empty = _empty_scene(
-            mask, um_per_px, calibration, (camera.height_px, camera.width_px), image, rng, mask_origin_um
-        )
+        self._empty = _empty_scene(mask, um_per_px, calibration, camera.shape, image, rng, mask_origin_um)
         self._scene = self._empty.copy()
 
     def add_still(self, point_um: Floats, radius_um: float, darkness: float) -> None:

@@ -95,7 +95,7 @@ def true_view(config: ResolvedConfig, chip: Chip) -> Calibration:
     keys, camera = ("um_per_px", "angle_deg", "mirror", "centre_um"), config.camera
     true = {key: value for key in keys if (value := getattr(config.simulated, key)) is not None}
     stated = registration_of(replace(camera, **true), chip)
-    return misregister(stated, config.simulated, (camera.width_px, camera.height_px))
+    return misregister(stated, config.simulated, camera.size_px)
 
 
 class SimulatedRig:

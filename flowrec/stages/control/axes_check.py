@@ -60,7 +60,7 @@ def watch(
         return previous
     if previous is None:
         return _round(None, track, robot, wall_um, frame_s)
-    dt_s = seconds(track.stamp_ns - previous.stamp_ns)
+    dt_s = track.since_s(previous)
     if dt_s > _GAP_S:
         return _round(previous, track, robot, wall_um, frame_s)
     now = _with_position(previous, track, applied, robot, steady_velocity(previous, map_um_s), dt_s)

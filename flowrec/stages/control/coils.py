@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flowrec.core import Currents, Demand, Floats, Range, UsageError, coil_names, seconds
+from flowrec.core import Currents, Demand, Floats, Range, UsageError, coil_names
 from flowrec.physics import Robot
 from flowrec.stages.control.amplifier import (
     WORST_CONDITION,
@@ -63,7 +63,7 @@ class Coils:
         """
         if previous is not None and previous.stamp_ns == demand.stamp_ns:
             return previous
-        dt_s = seconds(demand.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
+        dt_s = demand.since_s(previous)
         now = field_motion(*self.state_and_command(previous)).after(dt_s) if previous is not None else FieldState()
         full_mt, follow_hz = self.full_mt(robot), _follow_hz(robot)
         amplitude_mt = self._ramp(now.amplitude_mt, dt_s, 0.0 if finished or math.isnan(demand.error_um) else full_mt)

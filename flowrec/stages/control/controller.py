@@ -28,7 +28,6 @@ from flowrec.core import (
     bilinear,
     cell_at,
     compiled,
-    seconds,
 )
 from flowrec.physics import CONTROL, Robot
 from flowrec.stages.control.delay_compensation import append_demand, corrected_flow, predict_position
@@ -199,7 +198,7 @@ class Controller:
         if previous is not None and previous.stamp_ns == estimate.stamp_ns:
             return previous
         law = _law(self)
-        dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
+        dt_s = estimate.since_s(previous)
         sent = previous.sent_um_s if previous is not None else _NOTHING_SENT
         lag_s = 0.0 if estimate_uses_map else self.observer_lag_s / robot.speed_ratio
         flow = corrected_flow(field, estimate, sent, CONTROL.of(field, self.map_error), lag_s)

@@ -85,7 +85,7 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
         if mission.request != route.request:
             yield "the route to an earlier goal, or at an earlier speed limit, is not taken", None
             return
-    yield f"route adopted ({route.method}): {length_um(route) / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", None
+    yield f"route adopted ({route.method}): {length_um(route) / 1000:.2f} mm in {route.lasts_s:.1f} s", None
     if needs_time_to_go and route.method != "survey" and route.time_to_go_s is None:
         yield "no time to go is known from here: the route is followed as by control.method = vector", Level.WARNING
 
@@ -217,11 +217,11 @@ def _axes(last: Tick, tick: Tick) -> Iterator[Line]:
 
 def _streams(last: Tick, tick: Tick) -> Iterator[Line]:
     """Streams that have stopped or are back, and steps of their clocks."""
-    states, before = tick.extra.get(STREAMS), last.extra.get(STREAMS)
-    if not isinstance(states, StreamStates) or states is before:
+    states, before = (each.extra.of(STREAMS, StreamStates) for each in (tick, last))
+    if states is None or states is before:
         return
     was = dict[str, tuple[int, int]]()
-    if isinstance(before, StreamStates):
+    if before is not None:
         was = {name: (int(before.state[n]), int(before.steps[n])) for n, name in enumerate(before.stream_names())}
     for number, name in enumerate(states.stream_names()):
         state, steps = int(states.state[number]), int(states.steps[number])
@@ -236,10 +236,10 @@ def _streams(last: Tick, tick: Tick) -> Iterator[Line]:
 
 def _others(last: Tick, tick: Tick) -> Iterator[Line]:
     """Robots other than the mission's one that come near to a wall, or are off it again."""
-    walls, before = tick.extra.get(WALLS), last.extra.get(WALLS)
-    if not isinstance(walls, RobotWalls) or walls is before:
+    walls, before = (each.extra.of(WALLS, RobotWalls) for each in (tick, last))
+    if walls is None or walls is before:
         return
-    was = before.near if isinstance(before, RobotWalls) else np.zeros_like(walls.near)
+    was = before.near if before is not None else np.zeros_like(walls.near)
     for number in np.flatnonzero(walls.near > was).tolist():
         yield f"robot {number + 1} is {max(walls.wall_um[number], 0.0):.0f} um from a wall", Level.WARNING
     for number in np.flatnonzero(walls.near < was).tolist():

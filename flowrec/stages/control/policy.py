@@ -48,7 +48,7 @@ class Policy(VectorLaw):
         fastest = 1.0 + math.hypot(*drift)  # over ground, in units of the robot's own speed
         frame_um = robot.speed_limit_um_s * now.dt_s
         hold = left_um <= max(self.hold_radii * robot.radius_um, um_per_px, fastest * frame_um)
-        progress_s = float(route.arrival_s[-1]) if hold else nearest_time(route, now.estimate.position_um)
+        progress_s = route.lasts_s if hold else nearest_time(route, now.estimate.position_um)
         # A gradient on pixels needs two of them; beyond the goal there is none.
         distance_um = min(max(robot.radius_um, 2.0 * um_per_px, frame_um), left_um / fastest)
         return Reference(

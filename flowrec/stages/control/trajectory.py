@@ -29,7 +29,7 @@ def follow(now: Situation, route: Route, lag_free_um: float, lag_full_um: float,
         planned = velocity_at(route, previous.progress_s, max(now.dt_s, 1e-3))
         pace = governed_pace(position - estimate.position_um, planned, lag_free_um, lag_full_um)
         pace = feasible_pace(planned, now.flow.at(position), pace_fraction * now.limit_um_s, pace)
-        progress_s = min(previous.progress_s + pace * now.dt_s, float(route.arrival_s[-1]))
+        progress_s = min(previous.progress_s + pace * now.dt_s, route.lasts_s)
     future_s = progress_s + pace * robot.delay_s
     position = position_at(route, progress_s)
     return Reference(

@@ -107,7 +107,7 @@ class StepOut:
         wall_um : from the robot's centre to the nearest wall, which may stop the robot.
         """
         own_hz = robot.step_out_margin * robot.step_out_hz
-        dt, turns = seconds(estimate.stamp_ns - before.stamp_ns), math.hypot(*applied.turns)
+        dt, turns = estimate.since_s(before), math.hypot(*applied.turns)
         limited_ns, rolled_before = now.limited_ns, now.rolled_before_um_s
         if not estimate.seen:
             return replace(now, rolled_sums=_NONE)
@@ -197,7 +197,7 @@ class HealthMonitor:
         if previous is None or before is None:
             bank = (np.zeros(len(bank_hz)),) * 3
             return Health(estimate.stamp_ns, "", EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, *bank, np.zeros(2), 0.0)
-        dt = max(seconds(estimate.stamp_ns - before.stamp_ns), 0.0)
+        dt = max(estimate.since_s(before), 0.0)
         weight = min(dt / self.window_s, 1.0)
         lost = previous.lost_share + weight * (float(not estimate.seen) - previous.lost_share)
         nis = previous.nis

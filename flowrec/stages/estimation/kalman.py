@@ -23,7 +23,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowrec.core import Applied, Estimate, Floats, FlowField, Range, Share, Track, seconds
+from flowrec.core import Applied, Estimate, Floats, FlowField, Range, Share, Track
 from flowrec.physics import OBSERVER, Robot, sample_as_seen
 from flowrec.stages.estimation.process_model import ISOTROPIC, StateLayout, advance_covariance, gradient_at, propagate
 
@@ -94,7 +94,7 @@ class Kalman:
             x, y = float(innovation[0]), float(innovation[1])
             nis = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
             if previous is not None:
-                weight = self._innovation_weight(robot, seconds(track.stamp_ns - previous.stamp_ns))
+                weight = self._innovation_weight(robot, track.since_s(previous))
                 normal = innovation / math.sqrt(0.5 * (xx + yy))
                 size = math.hypot(*normal)
                 surprise = surprise + weight * (min(1.0, _LARGEST_INNOVATION / max(size, 1e-9)) * normal - surprise)
@@ -132,7 +132,7 @@ class Kalman:
                 state[2:4] = sample_as_seen(field, state[:2])
             return state, covariance, layout, np.eye(layout.size)
         state, covariance = state_of(previous, layout, robot)
-        dt = max(seconds(track.stamp_ns - previous.stamp_ns), 0.0)
+        dt = max(track.since_s(previous), 0.0)
         ahead, jacobian = propagate(
             state, layout, applied.turns, robot.um_per_rev, dt, field, constant_flow=not previous.seen
         )

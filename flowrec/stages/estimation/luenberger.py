@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import Applied, Estimate, FlowField, Range, Track, seconds
+from flowrec.core import Applied, Estimate, FlowField, Range, Track
 from flowrec.physics import Robot
 
 
@@ -28,7 +28,7 @@ class Luenberger:
         moved = robot.um_per_rev * applied.turns
         flow = np.zeros(2) if previous is None else previous.flow_um_s
         position = track.position_um
-        dt = 0.0 if previous is None else seconds(track.stamp_ns - previous.stamp_ns)
+        dt = track.since_s(previous)
         # Weight of the newest drift.
         weight = 1.0 - math.exp(-self.gain_per_s * dt) if dt > 0 else 0.0
         if previous is not None and dt > 0:

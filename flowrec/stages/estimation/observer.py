@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Method, Methods, Share, Track, seconds
+from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Method, Methods, Share, Track
 from flowrec.physics import Robot
 from flowrec.stages.estimation.kalman import Kalman, corrects_map, memory_s, newest_share
 from flowrec.stages.estimation.luenberger import Luenberger
@@ -122,7 +122,7 @@ class Observer:
 
 def _with_own_motion(previous: Estimate | None, estimate: Estimate, applied: Applied, robot: Robot) -> Estimate:
     """The estimate with the robot's mean own motion over the filter's memory, which is the delay of its flow."""
-    dt = 0.0 if previous is None else seconds(estimate.stamp_ns - previous.stamp_ns)
+    dt = estimate.since_s(previous)
     if previous is None or dt <= 0.0:
         return replace(estimate, rolled_um_s=np.zeros(2) if previous is None else previous.rolled_um_s)
     um_per_rev = robot.um_per_rev if estimate.um_per_rev is None else estimate.um_per_rev

@@ -107,9 +107,7 @@ class PumpFollower:
         """
         if not self.channels:
             return None
-        previous = last.extra.get(PUMP)
-        if not isinstance(previous, PumpShare):
-            previous = None
+        previous = last.extra.of(PUMP, PumpShare)
         if inlets is not None:
             return self._follow_each(last, tick, previous, inlets)
         now = self._share_of(last, tick, previous, self.channel, self.nominal)
@@ -172,8 +170,8 @@ class PumpFollower:
 
     def _measurement(self, last: Tick, tick: Tick, channel: str, nominal: float) -> tuple[Floats, Floats] | None:
         """Times and values, over the nominal one, of the samples of this tick; None without any."""
-        samples, states = tick.extra.get(SAMPLES), tick.extra.get(STREAMS)
-        if not isinstance(samples, Samples) or not isinstance(states, StreamStates):
+        samples, states = tick.extra.of(SAMPLES, Samples), tick.extra.of(STREAMS, StreamStates)
+        if samples is None or states is None:
             return None
         if samples is last.extra.get(SAMPLES) or channel not in (names := states.channel_names()):
             return None
@@ -260,8 +258,8 @@ def at_pump(flow: FlowField | None, pump: PumpShare | None, inlets: Superpositio
 
 def as_planned(tick: Tick, inlets: Superposition | None = None) -> Tick:
     """The tick of an order with its maps at the slow mean of the pump's flow: for routes."""
-    pump = tick.extra.get(PUMP)
-    if not isinstance(pump, PumpShare):
+    pump = tick.extra.of(PUMP, PumpShare)
+    if pump is None:
         return tick
     slow = replace(pump, share=pump.slow_share)
     if inlets is not None:

@@ -133,7 +133,7 @@ class Sampler:
         if variance > (self.settled_share * robot.max_speed_um_s) ** 2:
             return previous
         filter_memory_s = memory_s(estimate.covariance)
-        dt = seconds(estimate.stamp_ns - before.stamp_ns)
+        dt = estimate.since_s(before)
         if dt <= 0.0:
             return previous
         velocity = (estimate.position_um - before.position_um) / dt
@@ -144,7 +144,7 @@ class Sampler:
             distance = math.dist(position, previous.position_um[-1])
             if soon or distance < self.spacing_radii * robot.radius_um:
                 return previous
-            elapsed_s = seconds(estimate.stamp_ns - previous.stamp_ns)
+            elapsed_s = estimate.since_s(previous)
         own_um_s = math.hypot(*(velocity - estimate.flow_um_s))
         total = variance * (1.0 + 2.0 * filter_memory_s / elapsed_s) + (self.rolling_share * own_um_s) ** 2
         sigma = max(self.floor_um_s, math.sqrt(total))

@@ -54,7 +54,7 @@ def better_route(
         said = "the way so far is impossible in the refined flow: another is taken"
     else:
         noise = _noise_s(gain_s, gain, field, uncertainty, chip)
-        noise = math.hypot(noise, _NUMERICAL_SHARE * float(new.arrival_s[-1]))
+        noise = math.hypot(noise, _NUMERICAL_SHARE * new.lasts_s)
         if not gain > planner.replan_deviations * noise:
             return replace(present, reason=f"route kept: another would gain {gain:.1f} +- {noise:.1f} s")
         said = f"another route gains {gain:.1f} +- {noise:.1f} s"
@@ -72,13 +72,13 @@ def route_elsewhere(
     new = planner.plan(field, at, goal_um, chip, robot)
     if not new.reachable:
         return replace(present, reason=new.reason)
-    said = f"to {goal_um[0]:.0f}, {goal_um[1]:.0f} um in {new.arrival_s[-1]:.1f} s"
+    said = f"to {goal_um[0]:.0f}, {goal_um[1]:.0f} um in {new.lasts_s:.1f} s"
     return replace(_join_routes(present, from_s, new, said), goal_um=goal_um)
 
 
 def _branch(present: Route, from_s: float) -> tuple[float, Points]:
     """A time along a route and the place (2,) where it is then."""
-    from_s = min(max(from_s, 0.0), float(present.arrival_s[-1]))
+    from_s = min(max(from_s, 0.0), present.lasts_s)
     return from_s, np.array([np.interp(from_s, present.arrival_s, present.waypoints_um[:, c]) for c in (0, 1)])
 
 

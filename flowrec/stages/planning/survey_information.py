@@ -88,7 +88,7 @@ class SurveyMemory:
 
     def with_stretch(self, route: Route, expected: float) -> Route:
         """The route with this memory and one more stretch, after which an error is expected."""
-        row = [self.stated, expected, self.moved, self.progress_s, float(route.arrival_s[-1])]
+        row = [self.stated, expected, self.moved, self.progress_s, route.lasts_s]
         return replace(route, stretches=np.concatenate([self.stretches, [row]]), survey_flow_um_s=self.flow_um_s)
 
 
@@ -187,7 +187,7 @@ class Information(SurveyWays):
         route = self.timed_stretch(site.space, believed, best.path, site.start, best.speed_um_s)
         if not route.reachable:
             return route
-        said = f"from {100.0 * now:.1f} % to {100.0 * best.error:.1f} % of the flow in {route.arrival_s[-1]:.1f} s"
+        said = f"from {100.0 * now:.1f} % to {100.0 * best.error:.1f} % of the flow in {route.lasts_s:.1f} s"
         route = replace(route, waypoints_um=registration.to_measured(route.waypoints_um), reason=said, more=True)
         route = with_remarks(_join_stretch(order.present, route), site.start.remark, site.remark)
         return memory.with_stretch(route, best.error) if self.memory_stretches else route

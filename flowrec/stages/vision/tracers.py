@@ -99,11 +99,10 @@ class TracerTracker:
                 px = px[apart_px > _NEAR_ROBOT_RADII * max(each.radius_px, robot.radius_um / calibration.um_per_px)]
         spots_um = calibration.to_um(px).reshape(-1, 2)
         now_s, next_id = seconds(frame.stamp_ns), 0
-        std_um, dt = _STD_PX * calibration.um_per_px, 0.0
+        std_um, dt = _STD_PX * calibration.um_per_px, frame.since_s(previous)
         bodies = _new_bodies(np.zeros((0, 2)), 0, np.zeros(0), std_um, robot, now_s)
         if previous is not None:
             next_id = previous.next_id
-            dt = seconds(frame.stamp_ns - previous.stamp_ns)
             radius_um = self.search(1.0, robot).radius_px
             bodies = _predict(previous, dt, robot, _DIFFUSION_UM3_MPA / (chip.viscosity_mpa_s * radius_um))
         rows, columns = assign(bodies.position_um, bodies.std_um**2 + std_um**2, spots_um)

@@ -84,7 +84,7 @@ class TrackQuality:
         last = self._last
         if last is None:
             return
-        step_s = seconds(track.stamp_ns - last.stamp_ns)
+        step_s = track.since_s(last)
         moved_um = off_um = track.position_um - last.position_um
         if self._velocity is not None and len(self._steps_s):
             off_um = moved_um - self._velocity * min(step_s, _GOES_ON_FRAMES * self._steps_s[-1])

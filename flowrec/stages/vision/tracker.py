@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, UsageError, seconds
+from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, UsageError
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.vision.disc_search import (
     Disc,
@@ -308,7 +308,7 @@ class Tracker:
         frame, walls, calibration = scene.frame, scene.walls, scene.calibration
         radius_px = appearance.radius_px
         view = self._view(scene, radius_px)
-        dt, frames = seconds(frame.stamp_ns - previous.stamp_ns), 1 + previous.lost_frames
+        dt, frames = frame.since_s(previous), 1 + previous.lost_frames
         motion = ExpectedMotion.after(previous, calibration.to_px(previous.position_um), radius_px, dt)
         expected = (float(motion.expected_px[0]), float(motion.expected_px[1]))
         everywhere = previous.lost_frames > self.reacquire_after
@@ -390,7 +390,7 @@ class Tracker:
             x, y = scene.calibration.to_px(previous.position_um).tolist()
             centre = (x, y)
             frames = 1 + previous.lost_frames
-            dt = seconds(scene.frame.stamp_ns - previous.stamp_ns) / frames
+            dt = scene.frame.since_s(previous) / frames
             range_px = self._range_px(scene, previous.radius_px, dt) * frames
             box = box_around(centre, range_px, box)
             # While the robot is lost, an object of low likeness is more probably a piece of debris.
