@@ -57,7 +57,7 @@ def channel_profile(law: ViscosityLaw, half_m: float, mean_m_s: float, from_midd
 
     def speeds(wall: float) -> Floats:
         fall = cumulative_simpson(np.interp(wall * places / half_m, stresses, rates), x=places, initial=0.0)
-        return np.asarray(fall[-1] - fall)
+        return fall[-1] - fall
 
     def excess(wall: float) -> float:
         return float(np.trapezoid(speeds(wall), places)) / half_m - mean_m_s
@@ -133,7 +133,7 @@ def bend_drop(law: ViscosityLaw, inner_m: float, outer_m: float, flow_m2_s: floa
     def turning(drop: float, constant: float) -> Floats:
         tau = -0.5 * drop + constant / radius**2
         rate = np.sign(tau) * np.interp(np.abs(tau), stresses, rates)
-        return np.asarray(cumulative_simpson(rate / radius, x=radius, initial=0.0))
+        return cumulative_simpson(rate / radius, x=radius, initial=0.0)
 
     def flow(drop: float) -> float:
         ends = 0.5 * drop * inner_m**2, 0.5 * drop * outer_m**2

@@ -60,7 +60,7 @@ def bend(law: ViscosityLaw | None = None) -> Chip:
 def bend_distance(x: Floats, y: Floats) -> Floats:
     """Distance to the walls of the bend in px, negative in solid."""
     radius = np.hypot(x + 0.5, y + 0.5)
-    return np.asarray(np.minimum(radius - INNER_PX, OUTER_PX - radius))
+    return np.minimum(radius - INNER_PX, OUTER_PX - radius)
 
 
 def bend_slope(pressure_pa: Floats) -> float:

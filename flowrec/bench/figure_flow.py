@@ -151,4 +151,4 @@ def _arrow_places(mask: Bools) -> Ints:
 
 def _length(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
     """Magnitude in mm/s of vectors (..., 2) in um/s."""
-    return np.asarray(MM_PER_UM * np.linalg.norm(vectors, axis=-1))
+    return MM_PER_UM * np.linalg.norm(vectors, axis=-1)

@@ -224,7 +224,7 @@ def _relative(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:
 
 
 def _less_mean(pressure: NDArray[np.floating]) -> NDArray[np.floating]:
-    return np.asarray(pressure - pressure.mean())
+    return pressure - pressure.mean()
 
 
 def _on_device(method: Refiner | NullModel, device: Device) -> Refiner | NullModel:

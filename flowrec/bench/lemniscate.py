@@ -63,7 +63,7 @@ class LemniscateRun:
     @property
     def error_um(self) -> Floats:
         """(n,) distance to the reference."""
-        return np.asarray(np.hypot(*(self.reference_um - self.position_um).T))
+        return np.hypot(*(self.reference_um - self.position_um).T)
 
 
 def lemniscate(turns: int = 2) -> Route:
@@ -77,7 +77,7 @@ def place_um(time_s: Floats) -> Floats:
     theta = 2.0 * np.pi * time_s / PERIOD_S
     spread = (1.0 + np.sin(theta) ** 2)[:, None]
     points = np.stack([A_UM * np.cos(theta), B_UM * np.sin(theta) * np.cos(theta)], -1) / spread
-    return np.asarray(CENTRE_UM + points)
+    return CENTRE_UM + points
 
 
 def vortex_map(error: float) -> FlowField:

@@ -70,7 +70,7 @@ def drive(case: ObserverCase, seed: int = 0, laps: int = LAPS) -> ObserverRun:
     def flow(at: Floats) -> Floats:
         away = place_um(at) - CENTRE_UM
         pulse = 1.0 + case.pulsation * np.sin(2 * np.pi * PULSATION_HZ * at)
-        return np.asarray(SPIN_PER_S * pulse[:, None] * np.stack([-away[:, 1], away[:, 0]], -1))
+        return SPIN_PER_S * pulse[:, None] * np.stack([-away[:, 1], away[:, 0]], -1)
 
     place, true = place_um(time), flow(time)
     carried = (true[:-1] + 4.0 * flow(time[:-1] + 0.5 / RATE_HZ) + true[1:]) / (6.0 * RATE_HZ)

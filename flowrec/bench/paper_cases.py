@@ -317,7 +317,7 @@ def _crop(data: Path | None, rng: np.random.Generator) -> Bools:
     size = round(128 / scale)
     top, left = (int(rng.integers(0, max(extent - size, 1))) for extent in image.shape)
     window = image[top : top + size, left : left + size].astype(np.float32)
-    return np.asarray(cv2.resize(window, (128, 128), interpolation=cv2.INTER_AREA) > 0.5)
+    return cv2.resize(window, (128, 128), interpolation=cv2.INTER_AREA) > 0.5
 
 
 @lru_cache(maxsize=20)

@@ -50,12 +50,12 @@ class DrawnChip:
             draw_discs(image, stroke.line, 0.5 * stroke.width)
         parts, _ = label(image)
         x, y = np.round(to_fine(self.strokes[0].line[_POINTS // 2])).astype(int)
-        return np.asarray(parts == parts[y, x])
+        return parts == parts[y, x]
 
 
 def to_fine(points_px: Floats) -> Floats:
     """Points in pixels of the mask, in pixels of the truth."""
-    return np.asarray(FINE * points_px + (FINE - 1) / 2)
+    return FINE * points_px + (FINE - 1) / 2
 
 
 def draw_discs(image: np.ndarray, centres_px: Floats, radii_px: Floats, value: int = 1) -> None:
@@ -68,7 +68,7 @@ def draw_discs(image: np.ndarray, centres_px: Floats, radii_px: Floats, value: i
 def coarse(fine: Bools) -> Bools:
     """(h, w) the mask whose pixels are fluid where at least half of the truth's pixels in them are."""
     h, w = fine.shape[0] // FINE, fine.shape[1] // FINE
-    return np.asarray(fine.reshape(h, FINE, w, FINE).mean(axis=(1, 3)) >= 0.5)
+    return fine.reshape(h, FINE, w, FINE).mean(axis=(1, 3)) >= 0.5
 
 
 def draw_chip(rng: np.random.Generator) -> DrawnChip:

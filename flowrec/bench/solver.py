@@ -146,12 +146,12 @@ def _mask(pattern: Pattern, side: int) -> Bools:
     if pattern == "vessels":
         drawn = vessels(1).mask[:, :256]
         at = np.arange(side) * 256 // side
-        return np.asarray(drawn[at][:, at])
+        return drawn[at][:, at]
     y, x = np.mgrid[:side, :side] + 0.5
     x = x + (y // _PITCH_PX) % 2 * _PITCH_PX / 2
     mask = np.hypot(x % _PITCH_PX - _PITCH_PX / 2, y % _PITCH_PX - _PITCH_PX / 2) > _RADIUS_PX
     mask[:3] = mask[-3:] = False
-    return np.asarray(mask)
+    return mask
 
 
 def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -229,7 +229,7 @@ def thin(mask: Mask) -> Mask:
             a, b = (n[0] * n[2] * n[4], n[2] * n[4] * n[6]) if first else (n[0] * n[2] * n[6], n[0] * n[4] * n[6])
             image[1:-1, 1:-1] &= ~((count >= 2) & (count <= 6) & (turns == 1) & (a == 0) & (b == 0))
         if int(image.sum()) == before:
-            return np.asarray(image[1:-1, 1:-1])
+            return image[1:-1, 1:-1]
 
 
 def _largest(mask: Mask) -> Mask:

@@ -255,7 +255,7 @@ def _at(padded: Levels, points: Floats) -> Floats:
 
 def _along(values: Floats, sigma_px: float) -> Floats:
     """Values (n, ...) along a closed curve, blurred."""
-    return np.asarray(scipy.ndimage.gaussian_filter1d(values, sigma_px, axis=0, mode="wrap"))
+    return scipy.ndimage.gaussian_filter1d(values, sigma_px, axis=0, mode="wrap")
 
 
 def _profiles(padded: Levels, points: Floats, normals: Floats, reach_px: float, sizes: Ints) -> Floats:

@@ -360,4 +360,4 @@ def _correlation(a: Floats, b: Floats, weight: Ints) -> Floats:
     a = a - (weight * a).sum(1, keepdims=True) / total
     b = b - (weight * b).sum(1, keepdims=True) / total
     both = np.sqrt((weight * a * a).sum(1) * (weight * b * b).sum(1))
-    return np.asarray((weight * a * b).sum(1) / np.maximum(both, 1e-12))
+    return (weight * a * b).sum(1) / np.maximum(both, 1e-12)

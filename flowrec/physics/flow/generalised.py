@@ -133,14 +133,14 @@ class GeneralisedSystem(Equations):
         drag = (stress.at @ found.value) * (stress.strain @ flux)
         drag[: stress.viscous] = 0.0
         by_rate = self._viscous(found.slope * self._across_depth(found, flux), flux)
-        return np.asarray(stress.gather @ self._apply_drag(drag) + by_rate)
+        return stress.gather @ self._apply_drag(drag) + by_rate
 
     def _across_depth(self, found: _Viscosity, flux: Floats) -> Floats:
         """(m,) the part of gamma^2 that the depth adds."""
         stress = self.stress
         squares = found.weighted * (stress.gradient @ flux)
         squares[: stress.planar] = 0.0
-        return np.asarray(stress.square @ squares)
+        return stress.square @ squares
 
     def steady(
         self, drive: Floats, inertia: float, max_iterations: int, tolerance: float, push: Floats | float = 0.0
@@ -210,7 +210,7 @@ class GeneralisedSystem(Equations):
         squares = np.stack([before**2, (before + step) ** 2, step**2], axis=1)
         squares = stress.square @ (self._weights[:, None] * squares)
         least = TRUSTED**2 * np.minimum(squares[:, 0], squares[:, 1])
-        return np.asarray(least / np.maximum(least + squares[:, 2], 1e-300))
+        return least / np.maximum(least + squares[:, 2], 1e-300)
 
     @cached_property
     def _weights(self) -> Floats:
@@ -235,7 +235,7 @@ class GeneralisedSystem(Equations):
     def _viscous(self, viscosity: Floats, flux: Floats) -> Floats:
         """(faces,) viscous force and drag of viscosities (m,) on a flow."""
         stress = self.stress
-        return np.asarray(stress.gather @ self._apply_drag((stress.at @ viscosity) * (stress.strain @ flux)))
+        return stress.gather @ self._apply_drag((stress.at @ viscosity) * (stress.strain @ flux))
 
     def _apply_drag(self, stress: Floats) -> Floats:
         """Stresses (r,) with the drag of the depth times its factor."""

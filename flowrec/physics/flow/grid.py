@@ -90,7 +90,7 @@ class Grid:
     def pressure(self, cells: Floats) -> Floats:
         """Averages (h, w) over the fluid cells of each pixel of cell values (cells,): zero in solid."""
         total, count = (self._pixel_sums(values) for values in (np.append(cells, 0.0)[self.number_p], self.fluid))
-        return np.asarray(total / np.maximum(count, 1) * self.mask)
+        return total / np.maximum(count, 1) * self.mask
 
     def face_means(self, pixels: Floats) -> Floats:
         """(faces,) means of the cells on both sides of each face, of values (h, w) of the pixels."""
@@ -101,7 +101,7 @@ class Grid:
     def _pixel_sums(self, cells: Floats | Bools) -> Floats:
         """Sums over the cells (h k, w k) of each pixel (h, w)."""
         h, w = self.mask.shape
-        return np.asarray(cells.reshape(h, self.k, w, self.k).astype(np.float64).sum(axis=(1, 3)))
+        return cells.reshape(h, self.k, w, self.k).astype(np.float64).sum(axis=(1, 3))
 
 
 def _parabola(low: Floats, high: Floats) -> Floats:
@@ -194,7 +194,7 @@ def _split_cells(level: Floats) -> Bools:
     ring = [corner[:-1, :-1], flat[:-1], corner[:-1, 1:], upright[:, 1:], corner[1:, 1:], flat[1:], corner[1:, :-1]]
     ring.append(upright[:, :-1])
     changes = sum((one != two).astype(np.int64) for one, two in zip(ring, ring[1:] + ring[:1], strict=True))
-    return np.asarray((level[1::2, 1::2] <= 0.0) & (changes > 2))
+    return (level[1::2, 1::2] <= 0.0) & (changes > 2)
 
 
 def number_where(where: Bools, start: int) -> tuple[Ints, int]:

@@ -88,8 +88,8 @@ def _move_edges(mask: Bools, steps: int) -> Bools:
     if steps == 0:
         return mask
     if steps > 0:
-        return np.asarray(scipy.ndimage.binary_dilation(mask, iterations=steps))
-    return np.asarray(scipy.ndimage.binary_erosion(mask, iterations=-steps, border_value=1))
+        return scipy.ndimage.binary_dilation(mask, iterations=steps)
+    return scipy.ndimage.binary_erosion(mask, iterations=-steps, border_value=1)
 
 
 def _smooth(mask: Bools, k: int, offset_px: float) -> LevelSet:

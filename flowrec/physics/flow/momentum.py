@@ -56,7 +56,7 @@ class Momentum:
 
     def convection(self, flux: Floats) -> Floats:
         """N(q) (faces,): the momentum that leaves each control volume."""
-        return np.asarray(((self.side_flux @ flux) * (self.side_velocity @ flux)).reshape(6, -1).sum(axis=0))
+        return ((self.side_flux @ flux) * (self.side_velocity @ flux)).reshape(6, -1).sum(axis=0)
 
     def convection_jacobian(self, flux: Floats) -> Any:
         """dN/dq (faces, faces)."""

@@ -140,7 +140,7 @@ class Equations(ABC):
 
     def velocity(self, flux: Floats) -> Floats:
         """Velocity (n, 2) at the centres of the fluid pixels in m/s, of fluxes (faces,)."""
-        return np.asarray((self.momentum.centre @ flux).reshape(-1, 2))
+        return (self.momentum.centre @ flux).reshape(-1, 2)
 
     def pressure(self, load: Floats) -> Floats:
         """Cell values p h / mu (cells,) whose gradient balances a load (faces,); the pressure at outlets is zero."""
@@ -157,7 +157,7 @@ class System(Equations):
     stokes: Factors  # of C' (A + f V) C
 
     def viscous_force(self, flux: Floats) -> Floats:
-        return np.asarray(self.resistance @ flux)
+        return self.resistance @ flux
 
     def force_by_friction(self, flux: Floats) -> Floats:
         """(faces,) derivative of the viscous force with respect to ln of the depth friction."""
@@ -172,7 +172,7 @@ class System(Equations):
         """Stokes fluxes (faces,) or (faces, n) for drives (openings,) or (openings, n)."""
         given = self.stream.inflow @ drives
         force = self.stream.curl.T @ (self.momentum.outlet @ drives + push - self.resistance @ given)
-        return np.asarray(self.stream.curl @ self.stokes.solve(np.ascontiguousarray(force)) + given)
+        return self.stream.curl @ self.stokes.solve(np.ascontiguousarray(force)) + given
 
     def steady(
         self, drive: Floats, inertia: float, max_iterations: int, tolerance: float, push: Floats | float = 0.0

@@ -41,7 +41,7 @@ def sample_as_seen(field: FlowField, points_um: ArrayLike) -> Floats:
     velocity = sample(field, on_chip(field.registration, points_um))
     (xx, xy, _), (yx, yy, _) = field.registration
     x, y = velocity[..., 0], velocity[..., 1]
-    return np.asarray(np.stack((yy * x - xy * y, xx * y - yx * x), -1) / (xx * yy - xy * yx))
+    return np.stack((yy * x - xy * y, xx * y - yx * x), -1) / (xx * yy - xy * yx)
 
 
 class MapRaster(NamedTuple):

@@ -88,7 +88,7 @@ class FlowUncertainty:
         count = len(self.columns_um_s)
         modes = np.tensordot(self.covariance[:count, :count], self.columns_um_s, axes=1)
         variance = (modes * self.columns_um_s).sum(axis=0)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0) + self.error_um_s[:, None] ** 2))
+        return np.sqrt(np.maximum(variance, 0.0) + self.error_um_s[:, None] ** 2)
 
     @property
     def error_share(self) -> float:

@@ -122,7 +122,7 @@ class EmulatedWorld(SimulatedRig):
             turned = float(np.hypot(x, y))
             for swimmer in swimmers:
                 swimmer.advance(float(lasts_s), turned / float(lasts_s), float(np.arctan2(y, x)), float(turned > 0.0))
-        return np.asarray(turns[-1] - turns[0])
+        return turns[-1] - turns[0]
 
 
 @contextmanager

@@ -89,7 +89,7 @@ def _core(inside: Mask) -> Mask:
     if not ridge.any():
         return np.zeros_like(inside)
     away, (rows, columns) = scipy.ndimage.distance_transform_edt(~ridge, return_indices=True)
-    return np.asarray(away <= _CORE * distance[rows, columns])
+    return away <= _CORE * distance[rows, columns]
 
 
 def _without_specks(fluid: Mask, before: Mask) -> Mask:
@@ -110,7 +110,7 @@ def _specks(inside: Mask, before: Mask, neighbours: Floats | None) -> Mask:
     wholes[0] = 0
     was = scipy.ndimage.maximum(wholes[whole], pieces, np.arange(1, count + 1))
     small = np.concatenate(([False], (sizes[1:] < _SPECK_PX) & (2 * sizes[1:] < was)))
-    return np.asarray(small[pieces])
+    return small[pieces]
 
 
 def _obstacle(

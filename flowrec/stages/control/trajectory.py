@@ -49,7 +49,7 @@ def position_at(route: Route, time_s: float) -> Floats:
         return np.array(route.waypoints_um[0 if after == 0 else -1])
     begin, end = float(route.arrival_s[after - 1]), float(route.arrival_s[after])
     weight = (time_s - begin) / (end - begin)
-    return np.asarray((1.0 - weight) * route.waypoints_um[after - 1] + weight * route.waypoints_um[after])
+    return (1.0 - weight) * route.waypoints_um[after - 1] + weight * route.waypoints_um[after]
 
 
 def velocity_at(route: Route, time_s: float, over_s: float) -> Floats:

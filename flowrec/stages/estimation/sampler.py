@@ -164,7 +164,7 @@ def _central(values: Floats, discarded: float) -> Bools:
     """True where a value is neither among the largest nor the smallest; `discarded` is the fraction of either."""
     rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
     count = int(discarded * len(values))
-    return np.asarray((rank >= count) & (rank < len(values) - count))
+    return (rank >= count) & (rank < len(values) - count)
 
 
 def _polynomial(distance: Floats, values: Floats, std: Floats, degree: int) -> tuple[float, float]:

@@ -69,7 +69,7 @@ def _rolled_um_s(stamps: Sequence[int], applied: Sequence[Applied], memory: Floa
             keep = math.exp(-gaps[index - 1] / max(memory[order][index], 1e-9))
             mean[index] = keep * mean[index - 1] + (1.0 - keep) * mean[index]
         ways.append(mean[order])
-    return np.asarray(0.5 * (ways[0] + ways[1]))
+    return 0.5 * (ways[0] + ways[1])
 
 
 def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settled_share: float = 0.1) -> Observations:

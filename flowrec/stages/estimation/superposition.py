@@ -58,7 +58,7 @@ class Superposition:
     def departure_um_s(self, points_um: Floats, shares: Floats) -> Floats:
         """Velocity (m, 2) at points (m, 2) by which shares (n,) differ from their mean."""
         away = shares - self.mean(shares)
-        return np.asarray(sum(each * sample(part, points_um) for each, part in zip(away, self.parts, strict=True)))
+        return sum(each * sample(part, points_um) for each, part in zip(away, self.parts, strict=True))
 
     def at_shares(self, flow: FlowField, shares: Floats) -> FlowField:
         """A map as the pumps drive it at shares (n,)."""

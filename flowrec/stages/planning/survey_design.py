@@ -169,7 +169,7 @@ class Looks:
             (sums / np.sqrt(least + total)[:, None]).reshape(-1, unknowns)
             for sums, total in ((after, weights + added_weights), (before, weights))
         ]
-        return np.asarray(scaled.T @ scaled - shared[0].T @ shared[0] + shared[1].T @ shared[1])
+        return scaled.T @ scaled - shared[0].T @ shared[0] + shared[1].T @ shared[1]
 
     def _after(self, which: Ints, weight: Floats, effect: Floats) -> Looks:
         sums, weights = self.sums.copy(), self.weights.copy()

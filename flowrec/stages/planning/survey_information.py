@@ -84,7 +84,7 @@ class SurveyMemory:
         """(m,) part of each stretch that lies before a place of the route."""
         end_s = self.stretches[:, _END]
         begin_s = np.concatenate([[0.0], end_s[:-1]])
-        return np.asarray(np.clip((progress_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
+        return np.clip((progress_s - begin_s) / (end_s - begin_s), 0.0, 1.0)
 
     def with_stretch(self, route: Route, expected: float) -> Route:
         """The route with this memory and one more stretch, after which an error is expected."""

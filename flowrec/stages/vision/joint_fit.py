@@ -83,7 +83,7 @@ def fit_jointly(image: NDArray[np.generic], walls: Walls, margin_px: float, bodi
 
 def distances(places: Floats, radii: Floats) -> Floats:
     """(n, n) between bodies at places (n, 2), over the sum of their radii (n,)."""
-    return np.asarray(np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) / (radii[:, None] + radii))
+    return np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) / (radii[:, None] + radii)
 
 
 class _Prior(NamedTuple):

@@ -131,11 +131,11 @@ class ForegroundRegion:
 
     def to_px(self, blocks: Floats) -> Floats:
         """Points (..., 2) in blocks to camera pixels."""
-        return np.asarray(blocks * self.scale.step + np.array([self.x0, self.y0]))
+        return blocks * self.scale.step + np.array([self.x0, self.y0])
 
     def to_blocks(self, points_px: Floats) -> Floats:
         """Points (..., 2) in camera pixels to blocks."""
-        return np.asarray((points_px - np.array([self.x0, self.y0])) / self.scale.step)
+        return (points_px - np.array([self.x0, self.y0])) / self.scale.step
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +313,7 @@ def hidden_neighbours(missed: Floats, place_px: Floats, radius_px: float) -> Flo
 def _move_cost(found: Candidates, motion: ExpectedMotion, distance2: Floats, energy: float) -> Floats:
     """Cost (n,) of a move and of a change of energy: a heavy tail, because robots and neighbours jump at times."""
     changed = np.abs(np.log(found.energy / max(energy, 1e-6)))
-    return np.asarray(_MOTION_COST * np.log1p(distance2 / motion.spread_px**2) + changed)
+    return _MOTION_COST * np.log1p(distance2 / motion.spread_px**2) + changed
 
 
 def similar(found: Candidates, which: int, motion: ExpectedMotion) -> bool:

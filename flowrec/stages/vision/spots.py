@@ -106,10 +106,10 @@ def _half_size(sigma_px: float) -> int:
 
 def _blur(light: np.ndarray, sigma_px: float) -> np.ndarray:
     size = 2 * _half_size(sigma_px) + 1
-    return np.asarray(cv2.GaussianBlur(light, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE))
+    return cv2.GaussianBlur(light, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE)
 
 
 def _vertex(before: Floats, here: Floats, after: Floats) -> Floats:
     """Place of the vertex of the parabola through three values in a row, from the middle one, within half a step."""
     bend = np.minimum(before + after - 2.0 * here, -1e-12)
-    return np.asarray(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
+    return np.clip(0.5 * (before - after) / bend, -0.5, 0.5)

@@ -152,7 +152,7 @@ def _directions(background: Background) -> Floats:
         return np.zeros((2, 0))
     gradients = background.pixels[:, 3:]
     structure, axes = np.linalg.eigh(gradients.T @ gradients / len(gradients))
-    return np.asarray(axes[:, structure > _LEAST_STRUCTURE * _GRADIENT_NOISE * background.noise**2])
+    return axes[:, structure > _LEAST_STRUCTURE * _GRADIENT_NOISE * background.noise**2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
