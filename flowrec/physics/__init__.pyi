@@ -29,6 +29,7 @@ from .chip.synthetic import (
     bifurcation as bifurcation, draw_channel as draw_channel, smooth_curve as smooth_curve, straight as straight,
     vessels as vessels,
 )
+from .flow.contour_smoothing import smooth_contours as smooth_contours
 from .flow.generalised import generalised_equations as generalised_equations
 from .flow.level_set import from_distance as from_distance
 from .flow.linear_solver import chip_key as chip_key, clear_cache as clear_cache, compute_cached as compute_cached
@@ -47,5 +48,5 @@ from .flow.sensitivities import Remainder as Remainder, Sensitivities as Sensiti
 from .flow.solver import FlowSolver as FlowSolver
 from .flow.uncertainty import Doubts as Doubts, FlowUncertainty as FlowUncertainty, Registration as Registration
 from .flow.velocity_stencil import pixel_weights as pixel_weights, velocity_at as velocity_at
-from .flow.wall_offset import with_wall_offset as with_wall_offset
+from .flow.wall_offset import with_levels as with_levels, with_wall_offset as with_wall_offset
 from .robot import Robot as Robot, RobotSettings as RobotSettings, USUAL_DELAY_S as USUAL_DELAY_S

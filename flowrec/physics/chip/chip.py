@@ -6,14 +6,15 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from flowrec.core import Bools, Floats, Range, Seed
+from flowrec.core import Bools, Floats, Floats32, Range, Seed
 from flowrec.physics.chip.fluid import ViscosityLaw, ViscositySettings
 
 Side = Literal["left", "right", "top", "bottom"]
 Kind = Literal["inlet", "outlet"]
-Walls = Literal["smooth", "pixel"]
+Walls = Literal["smooth", "pixel", "grey"]
+GREYS_PER_PX = 50.0  # of a mask whose walls lie between its pixel centres: 128 is on the wall
 WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0  # at 20 degrees C, to 0.2 %
 
 
@@ -29,7 +30,7 @@ class ChipSettings:
     um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None
     # where the walls lie: smooth, on a contour through the pixels of the mask; pixel, on their edges. None: as the
     # chip's file states
-    walls: Walls | None = None
+    walls: Literal["smooth", "pixel"] | None = None
     # channel depth, for the depth-averaged friction; 0: two-dimensional
     depth_um: Annotated[float, Range(0.0, 1e5)] | None = None
     # viscosity of the fluid; of one that is not Newtonian, the unit of its law. None: as the chip's file states
@@ -78,6 +79,8 @@ class Chip:
     # (h, w) the mask whose walls, moved outwards by the offset, are those of the chip; None: its own mask's
     drawn: Bools | None = None
     wall_offset_px: float = 0.0
+    # (h, w) signed distance in px of the pixel centres of `drawn` to the walls, of walls `grey`
+    level_px: Floats32 | None = None
 
     @property
     def size_um(self) -> tuple[float, float]:
@@ -118,3 +121,13 @@ class Chip:
             viscosity_mpa_s=self.viscosity_mpa_s if viscosity_mpa_s is None else viscosity_mpa_s,
             density_kg_m3=self.density_kg_m3 if density_kg_m3 is None else density_kg_m3,
         )
+
+
+def greys_of(level_px: Floats32) -> NDArray[np.uint8]:
+    """(h, w) grey levels of a mask from the signed distances of its pixel centres to the walls, in px."""
+    return np.clip(np.rint(128.0 + GREYS_PER_PX * level_px), 0.0, 255.0).astype(np.uint8)
+
+
+def levels_of(greys: NDArray[np.uint8]) -> Floats32:
+    """(h, w) signed distances to the walls, in px, of grey levels."""
+    return np.asarray((greys.astype(np.float64) - 128.0) / GREYS_PER_PX, np.float32)

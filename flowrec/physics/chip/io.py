@@ -4,7 +4,7 @@
     viscosity_mpa_s = 1.0     # 1.0
     density_kg_m3 = 1000.0    # 1000
     depth_um = 100.0          # left out: two-dimensional
-    walls = "smooth"          # "smooth": a smooth contour through the pixels; "pixel": their edges
+    walls = "smooth"          # "smooth": a smooth contour through the pixels; "pixel": their edges; "grey": see below
     fluid = "bright"          # "bright": fluid is >= 128; "dark": fluid is < 128
     name = "y_junction"       # the stem of the file
     inlet_speed_um_s = 200.0  # of inlets that are found, not listed
@@ -19,6 +19,8 @@
     last = 119
     kind = "inlet"            # inlet (speed_um_s: mean inward) or outlet (pressure_pa, 0)
     speed_um_s = 200.0
+
+With walls "grey" a wall lies where the grey level between pixel centres is 128, and 50 levels are a pixel.
 
 Fluid that no opening reaches does not flow: such pockets are filled on loading.
 
@@ -47,7 +49,18 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from flowrec.core import Bools, ChipError, hints, parse_toml, refuse_irregular
-from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings, Kind, Opening, Side, Walls
+from flowrec.physics.chip.chip import (
+    WATER_KG_M3,
+    WATER_MPA_S,
+    Chip,
+    ChipSettings,
+    Kind,
+    Opening,
+    Side,
+    Walls,
+    greys_of,
+    levels_of,
+)
 from flowrec.physics.chip.fluid import (
     BLOOD_KG_M3,
     BLOOD_MPA_S,
@@ -139,6 +152,8 @@ def read_case(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
 
 MAX_PIXELS = 3_600_000  # the flow field of a larger mask exceeds the largest chunk that a session may have
 # A mask is black and white, but for the blurred edges of its channels.
+_WALL = 128  # grey level of fluid, at least
+_POCKET_PX = 1.0  # level of what is filled
 _BLACK, _WHITE, _MOST_BETWEEN, _MOST_LEVELS = 32, 223, 0.25, 32
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 BUILT_IN: Mapping[str, Callable[[ChipSettings], Chip]] = {
@@ -195,7 +210,10 @@ def load_chip(settings: ChipSettings, mask: Bools | None = None) -> Chip:
 
 def chip_files(chip: Chip) -> tuple[bytes, str]:
     """PNG and TOML of a chip, from which `chip_from_files` makes exactly the same one."""
-    written, png = cv2.imencode(".png", np.where(chip.mask, 255, 0).astype(np.uint8))
+    greys = np.where(chip.mask, 255, 0).astype(np.uint8)
+    if chip.walls == "grey" and chip.level_px is not None:
+        greys = greys_of(chip.level_px)
+    written, png = cv2.imencode(".png", greys)
     if not written:
         raise ChipError(f"{chip.name}: the mask can not be written as PNG; is it {chip.mask.shape} pixels?")
     numbers = {key: getattr(chip, key) for key in CHIP_NUMBERS}
@@ -229,7 +247,11 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
         number["um_per_px"] = um_per_px
     if number["um_per_px"] is None:
         raise ChipError(f"{where}: no um_per_px; set chip.um_per_px or put it into a TOML of the same name")
-    mask = _mask(png_bytes, _choice(table, "fluid", ("bright", "dark"), where) or "bright", where)
+    walls = cast(Walls, _choice(table, "walls", get_args(Walls), where) or "smooth")
+    fluid = _choice(table, "fluid", ("bright", "dark"), where) or "bright"
+    greys = _greys(png_bytes, fluid, where, between=walls == "grey")
+    mask = np.asarray(greys >= _WALL)
+    mask.flags.writeable = False
     if "opening" in table:
         openings = _openings_of(table["opening"], where)
     else:
@@ -245,8 +267,9 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
         number["viscosity_mpa_s"],
         number["density_kg_m3"],
         number["depth_um"],
-        cast(Walls, _choice(table, "walls", get_args(Walls), where) or "smooth"),
+        walls,
         law=law,
+        level_px=levels_of(greys) if walls == "grey" else None,
     )
     check_chip(chip, where)
     return chip
@@ -257,7 +280,10 @@ def without_pockets(chip: Chip) -> Chip:
     labels, _ = scipy.ndimage.label(chip.mask)
     mask = np.isin(labels, [border(labels, opening.side)[opening.first] for opening in chip.openings])
     mask.flags.writeable = False
-    return replace(chip, mask=mask)
+    if chip.level_px is None:
+        return replace(chip, mask=mask)
+    level_px = np.where(chip.mask & ~mask, -_POCKET_PX, chip.level_px).astype(np.float32)
+    return replace(chip, mask=mask, level_px=level_px)
 
 
 def _read_chip(path: Path, um_per_px: float | None) -> Chip:
@@ -291,7 +317,8 @@ def _read_chip(path: Path, um_per_px: float | None) -> Chip:
     return chip_from_files(data, text, str(path), um_per_px)
 
 
-def _mask(png_bytes: bytes, fluid: str, where: str) -> Bools:
+def _greys(png_bytes: bytes, fluid: str, where: str, between: bool) -> NDArray[np.uint8]:
+    """(h, w) grey levels, fluid is bright; `between`: walls may lie between pixel centres."""
     grey = None
     if png_bytes.startswith(_PNG_HEAD) and len(png_bytes) >= len(_PNG_HEAD) + 8:
         # The size in the header is checked before the image is decoded: a small file could demand gigabytes.
@@ -304,17 +331,13 @@ def _mask(png_bytes: bytes, fluid: str, where: str) -> Bools:
             grey = None
     if grey is None:
         raise ChipError(f"{where}: the mask is no PNG image, or a damaged one; save it again as 8-bit grey")
-    between = float(((grey > _BLACK) & (grey < _WHITE)).mean())
-    if between > _MOST_BETWEEN and len(np.unique(grey)) > _MOST_LEVELS:
+    part = 0.0 if between else float(((grey > _BLACK) & (grey < _WHITE)).mean())
+    if part > _MOST_BETWEEN and len(np.unique(grey)) > _MOST_LEVELS:
         raise ChipError(
-            f"{where}: a photograph, not a mask: {100 * between:.0f} % of its pixels are neither black nor white; "
+            f"{where}: a photograph, not a mask: {100 * part:.0f} % of its pixels are neither black nor white; "
             f"flowrec calibrate chip {where} --um-per-px UM -o CHIP.toml makes the mask of it"
         )
-    mask = np.asarray(grey) >= 128
-    if fluid == "dark":
-        mask = ~mask
-    mask.flags.writeable = False
-    return mask
+    return np.asarray(255 - grey if fluid == "dark" else grey, np.uint8)
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:

@@ -15,6 +15,7 @@ straight wall to 1 / (2 sqrt(p^2 + q^2)) pixels, which is 0.35 at 45 degrees.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,6 +137,16 @@ def contour_segments(mask: Bools, per_gate: int) -> tuple[Floats, Floats]:
     begins += [point[first[open_]] - BEYOND_PX * tangent[first[open_]], point[last[open_]]]
     ends += [point[first[open_]], point[last[open_]] + BEYOND_PX * tangent[last[open_]]]
     return np.concatenate(begins), np.concatenate(ends)
+
+
+def smooth_contours(mask: Bools) -> Iterator[tuple[Floats, bool]]:
+    """Points (n, 2) x, y in pixels on each wall, in order with the fluid on the right; and whether it is closed."""
+    crossed = find_gates(mask)
+    if not len(crossed.wall):
+        return
+    point = _smoothest(crossed)
+    for wall, closed in enumerate(crossed.closed.tolist()):
+        yield point[crossed.wall == wall], closed
 
 
 def _enclosed_areas(a: Floats, b: Floats, wall: Ints) -> Floats:

@@ -118,7 +118,7 @@ def build(chip: Chip, k: int, walls: LevelSet | None = None) -> Grid:
     """
     if walls is None:
         drawn = chip.mask if chip.drawn is None else chip.drawn
-        walls = from_mask(drawn, k, chip.walls, chip.wall_offset_px)
+        walls = from_mask(drawn, k, chip.walls, chip.wall_offset_px, chip.level_px)
     level = walls.level
     split = _split_cells(level)
     # Upright faces; the level ones are those with rows and columns exchanged.

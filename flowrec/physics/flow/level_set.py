@@ -58,12 +58,18 @@ def from_distance(distance: Callable[[Floats, Floats], Floats], shape: tuple[int
     return LevelSet(np.asarray(distance(x, y), np.float64), staircase=False)
 
 
-def from_mask(mask: Bools, k: int, walls: Walls, offset_px: float = 0.0) -> LevelSet:
+def from_mask(mask: Bools, k: int, walls: Walls, offset_px: float = 0.0, level_px: Floats32 | None = None) -> LevelSet:
     """Walls of a mask (h, w): `pixel` follows the edges of its pixels, `smooth` the smoothest contour it allows.
 
+    `grey` follows the zero line of `level_px` (h, w), levels of the pixel centres with the signs of the mask.
     Walls can be moved outwards by an offset, those of pixels by multiples of half a subcell.
     """
-    return _staircase(mask, k, offset_px) if walls == "pixel" else _smooth(mask, k, offset_px)
+    if walls == "pixel":
+        return _staircase(mask, k, offset_px)
+    if walls == "smooth":
+        return _smooth(mask, k, offset_px)
+    assert level_px is not None
+    return _between_centres(level_px, mask, k, offset_px)
 
 
 def subcells(pixels: NDArray[Any], k: int) -> NDArray[Any]:
@@ -118,6 +124,16 @@ def _smooth(mask: Bools, k: int, offset_px: float) -> LevelSet:
         np.add.at(sign, sample, side[closest])
         flat = level.ravel()
         flat[sample] = np.copysign(nearest[sample], np.where(sign[sample] == 0.0, flat[sample], sign[sample]))
+    _keep_topology(level, mask, k)
+    return LevelSet(level / unit + offset_px, staircase=False)
+
+
+def _between_centres(level_px: Floats32, mask: Bools, k: int, offset_px: float) -> LevelSet:
+    """Levels (h, w) at the centres of the pixels, bilinear between them, moved outwards."""
+    unit = 2 * k
+    rows, columns = (np.arange(size * unit + 1) / unit - 0.5 for size in mask.shape)
+    at = np.meshgrid(rows, columns, indexing="ij")
+    level = unit * scipy.ndimage.map_coordinates(level_px.astype(np.float64), at, order=1, mode="nearest")
     _keep_topology(level, mask, k)
     return LevelSet(level / unit + offset_px, staircase=False)
 

@@ -242,7 +242,7 @@ def geometry_key(chip: Chip, k: int) -> tuple[Hashable, ...]:
     """All of a chip that the matrices depend on, as part of a cache key."""
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
     mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    walls = (chip.walls, array_key(chip.drawn), chip.wall_offset_px)
+    walls = (chip.walls, array_key(chip.drawn), chip.wall_offset_px, array_key(chip.level_px))
     return (*mask, openings, *walls, k, depth_friction(chip, k), array_key(chip.friction_per_um2))
 
 

@@ -24,6 +24,7 @@ from flowrec.physics import (
     load_chip,
     median_width_um,
     opening_point_um,
+    with_levels,
 )
 from flowrec.physics.chip.clearance import nearest_fluid
 
@@ -59,6 +60,19 @@ def test_a_chip_survives_its_two_files_exactly():
     )
     for chip in (*chips, odd):
         assert same_chip(chip_from_files(*chip_files(chip)), chip)
+
+
+def test_walls_between_pixel_centres_survive_the_two_files_and_pockets_in_them_are_filled():
+    chip = load_chip(ChipSettings("bifurcation"))
+    level_px = np.clip(clearance_um(chip.mask, 1.0) + 0.3, -2.5, 2.5)
+    level_px[2:4, 2:4] = 0.7  # fluid that no opening reaches
+    grey = with_levels(chip, level_px)
+    again = chip_from_files(*chip_files(grey))
+    assert not grey.mask[2, 2]
+    assert grey.walls == again.walls == "grey"
+    assert np.array_equal(again.level_px, grey.level_px)
+    assert np.array_equal(again.mask, grey.mask)
+    assert np.abs(grey.level_px - level_px)[10:].max() <= 0.011  # steps of a grey level
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from flowrec.physics import Chip, FlowSolver, Opening, find_openings, from_distance, guess_inlets
+from flowrec.physics import (
+    Chip,
+    FlowSolver,
+    Opening,
+    find_openings,
+    from_distance,
+    guess_inlets,
+    with_levels,
+    with_wall_offset,
+)
 from flowrec.physics.flow import newton_solver as systems
 from flowrec.physics.flow.contour_smoothing import contour_segments
 from flowrec.physics.flow.grid import INLET
@@ -229,3 +238,17 @@ def test_a_lid_drives_a_closed_box():
     assert u.min() == pytest.approx(-0.2140, abs=0.006)
     assert np.isfinite(equations.pressure(equations.residual(moving, np.zeros(0), reynolds / n, push)[:, None])).all()
     assert (equations.grid.u.kind != INLET).all()
+
+
+@pytest.mark.parametrize("width_px", [9.3, 10.0, 10.7])
+def test_walls_at_grey_levels_lie_between_the_pixels_and_move_outwards_from_there(width_px):
+    rows = np.abs(np.arange(20) - 9.5)
+    level_px = np.repeat((0.5 * width_px - rows)[:, None], 60, axis=1).astype(np.float32)
+    mask = level_px > 0.0
+    openings = guess_inlets(find_openings(mask), SPEED * width_px / mask[:, 0].sum())
+    chip = with_levels(Chip("straight", mask, UM_PER_PX, openings, 1.0, 1000.0), level_px)
+    for moved, width in ((chip, width_px), (with_wall_offset(chip, 0.25), width_px + 0.5)):
+        drop = np.diff(FlowSolver(k=2).solve(moved).pressure_pa[10, [20, 40]])[0]
+        # The flow rate is the same in wider walls: 12 mu Q / w^3.
+        expected = -12e-3 * SPEED * 1e-6 * width_px * 20.0 / (width**3 * UM_PER_PX * 1e-6)
+        assert drop == pytest.approx(expected, rel=0.02)
