@@ -15,3 +15,4 @@ from .motion_fit import MotionFit as MotionFit, UNEXPLAINED as UNEXPLAINED
 from .picture_registration import ImageVerdict as ImageVerdict, orientation_by_image as orientation_by_image
 from .proposal import as_toml as as_toml
 from .tuning import tune as tune
+from .wall_trace import as_pictured as as_pictured

@@ -72,7 +72,7 @@ def _is_blank(picture: Image) -> bool:
     return float(np.ptp(picture)) < _LEAST_CONTRAST
 
 
-def _shows_walls(picture: Image, chip: Chip) -> bool:
+def is_legible(picture: Image, chip: Chip) -> bool:
     """False where the picture is small or blank, or the chip, like an open field, has walls along its border only."""
     return not (_is_small(picture) or _is_blank(picture) or chip.is_open_field)
 
@@ -126,7 +126,7 @@ def fit_nearby(picture: Image, chip: Chip, assumed: Calibration) -> WallFit | No
 
     None if the picture does not show the walls nearby.
     """
-    if not _shows_walls(picture, chip):
+    if not is_legible(picture, chip):
         return None
     scene = _ChipInPicture(picture, chip)
     grown = [AS_STATED.about(assumed, scene.middle_px, growth) for growth in _NEAR_GROWTHS]
@@ -220,7 +220,7 @@ class ImageVerdict(NamedTuple):
 
 def orientation_by_image(picture: Image, chip: Chip, stated: Calibration) -> ImageVerdict:
     """The verdict of a picture (h, w) on the stated registration."""
-    if not _shows_walls(picture, chip):
+    if not is_legible(picture, chip):
         return ImageVerdict("", ())
     scene = _ChipInPicture(picture, chip)
 

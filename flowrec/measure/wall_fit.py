@@ -89,7 +89,7 @@ class Fitter:
         # Pixels of the picture to one of those that are fitted, along x and y.
         self._step = self._size_px / small.shape[::-1]
         self._sigma_px = 2.0 * reach_um / (um_per_px * step)
-        self._levelled = _level_contrast(small, 2.0 * self._sigma_px)
+        self._levelled = level_contrast(small, 2.0 * self._sigma_px)
         self._contrasts: dict[float, Levels] = {}
 
     def fit(self, start: Calibration) -> WallFit:
@@ -122,7 +122,7 @@ class Fitter:
         sigma_px = max(blur_px, _CONTRAST_BLUR_PX)
         if sigma_px not in self._contrasts:
             size = np.hypot(*gradient(blur_image(self._levelled, sigma_px)))
-            self._contrasts[sigma_px] = _level_contrast(size, 2.0 * self._sigma_px)
+            self._contrasts[sigma_px] = level_contrast(size, 2.0 * self._sigma_px)
         return self._contrasts[sigma_px]
 
     def _fit(self, reading: Callable[[float], Levels], start: Calibration, stages: Stages = _STAGES) -> WallFit:
@@ -166,7 +166,7 @@ class Fitter:
         return WallFit(now, model.explained, found, seen, residual_um, std, np.zeros(4))
 
 
-def _level_contrast(image: Levels, sigma_px: float) -> Levels:
+def level_contrast(image: Levels, sigma_px: float) -> Levels:
     """An image without its slow variation, of even contrast."""
     high = image - cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT)
     power = cv2.GaussianBlur(high * high, (0, 0), 2.0 * sigma_px, borderType=cv2.BORDER_REFLECT)

@@ -1,0 +1,386 @@
+"""Walls of a chip as a picture shows them: how the chip lies in it, and where each wall differs from the mask.
+
+Along the contour of the mask stand profiles across the wall. They look alike, whatever walls look like: a dark line, a
+step, both. In oblique light they also differ by the direction in which the fluid lies, as a + b cos + c sin of it. A
+chip that lies elsewhere makes the same difference, so this is asked only where walls that may move still look
+different, and begins at the pose of wall_fit.py, which light from one side does not mislead.
+
+The wall of each profile is moved to where it correlates best with the common profile, by dynamic programming:
+neighbours along a wall move nearly alike (an active contour; Amini, Weymouth and Jain 1990). The motion that all walls
+share is one of the chip in the image, by robust least squares; what is left are errors of the mask.
+
+A wall that the picture does not show, and one that debris or the robot hides, moves as its neighbours do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import scipy  # its ndimage and spatial load at first use, not at start-up
+from numpy.typing import NDArray
+
+from flowrec.core import Bools, ChipError, Floats, Floats32, FlowError, Image, Ints
+from flowrec.measure.images import Levels
+from flowrec.measure.picture_registration import fit_nearby, is_legible
+from flowrec.measure.wall_fit import level_contrast
+from flowrec.measure.wall_search import move_chip
+from flowrec.physics import Calibration, Chip, check_point, median_width_um, smooth_contours, with_levels
+from flowrec.stages import ResolvedConfig, registration_of
+
+_STEP_PX = 0.125  # between the places that are compared, in px of the mask, as all lengths here
+_OUT_PX, _IN_WIDTHS = 3.0, 0.45  # largest motion of a wall outwards; and inwards, in median channel widths
+_WINDOW_WIDTHS, _WINDOW_PX = 0.3, (1.0, 2.0)  # half length of a profile: in median channel widths, but within this
+_STEPS_ALONG = 4  # by which neighbours may differ at most
+_STIFFNESS, _REST = 0.15, 0.01  # costs of a difference (px^2) between neighbours, and of a motion (px)
+_ALONG_PX = 1.0  # over which profiles are averaged along a wall
+_LIKE = 0.5  # correlation from which a wall counts as seen
+# Profiles' b and c over their a from which on light comes from one side: 0.30 and 0.57 in relief, under 0.1 in eleven
+# other looks of walls.
+_SIDED = 0.2
+_FAINT = 0.3  # contrast of a profile, relative to the median, below which it shows no wall
+_BORDER_PX = 2.0  # from the border of the mask: openings keep their place
+# All walls lie aside of the mask's from here on, as far as the middle of their steep profile; with a right mask that
+# is 0 to 0.4 px off, because some walls have a fringe on one side.
+_ASIDE_PX = 0.45
+_ROUNDS, _STILL_PX = 6, 0.05  # of profile, walls and pose; until the pose moves less
+# Part of the walls in the picture, their length, and how far they may be off: walls that are found in blurred noise are
+# 82 to 85 % alike and 2.1 px off (root mean square), those of chips with walls up to a pixel off 97 % and 0.8 px.
+_LEAST_SEEN, _LEAST_WALL_PX, _MOST_WALL_PX = 0.9, 30, 1.5
+_UNKNOWN = 0.02  # motions that move walls by less, relative to the others, stay as stated: along a straight channel
+_REACH_PX = 6.0  # from a wall, up to which the side of it is that of the nearest point
+_DENSE = 8  # points of a wall per pixel, from which distances are taken
+_NOISE_PX = 0.15  # walls that differ by less (root mean square) are those of the mask: so far a right mask is taken off
+# Median correlation of a picture clear enough to correct a mask: of a right one, a trace in noise (correlation 0.86 to
+# 0.94) or out of focus (0.75 to 0.85) is 0.3 to 0.6 px off, of other looks (over 0.98) at most 0.14.
+_CLEAR = 0.96
+_SAME_PX = 0.1  # of the camera: a pose that differs by less is the stated one
+
+
+class TracedWalls(NamedTuple):
+    """Where the walls are in a picture."""
+
+    calibration: Calibration  # how the chip lies in the picture
+    moved_px: float  # root mean square distance, in the picture's pixels, of the walls by it from the stated ones
+    level_px: Floats32  # (h, w) signed distances of the mask's pixel centres to the walls
+    wall_px: float  # root mean square distance of the walls from those of the mask, in its pixels
+    alike: float  # median correlation of a wall with the others
+
+    @property
+    def walls_differ(self) -> bool:
+        """True if the mask differs from what the picture shows by more than the noise of a trace."""
+        return self.wall_px > _NOISE_PX and self.alike >= _CLEAR
+
+    @property
+    def chip_lies_elsewhere(self) -> bool:
+        """True if the stated registration differs by more than the noise of a trace."""
+        return self.moved_px > _SAME_PX
+
+
+def as_pictured(config: ResolvedConfig, chip: Chip, picture: Image) -> tuple[ResolvedConfig, Chip, str]:
+    """A configuration and its chip with the registration and the walls of a picture (h, w); and what changed, in words.
+
+    Both stay as they are where the picture does not show the walls, or shows them within the noise of a trace. A chip
+    whose openings would close, or with no room for the robot at start or goal, keeps the walls of its mask. An open
+    field has none: '' then.
+    """
+    if chip.is_open_field:
+        return config, chip, ""
+    stated = registration_of(config.camera, chip)
+    traced = trace_walls(picture, chip, stated)
+    if traced is None:
+        return config, chip, "the image does not show the walls: registration and mask are as stated"
+    found = []
+    if traced.chip_lies_elsewhere:
+        height, width = picture.shape
+        now = traced.calibration
+        x_um, y_um = now.to_um((0.5 * (width - 1), 0.5 * (height - 1))).tolist()
+        camera = replace(config.camera, um_per_px=now.um_per_px, angle_deg=now.angle_deg, centre_um=(x_um, y_um))
+        config = replace(config, camera=camera)
+        found.append(f"the chip lies {traced.moved_px:.2g} px from where the registration puts it")
+    if traced.walls_differ:
+        walls = f"its walls are {traced.wall_px * chip.um_per_px:.2g} um off the mask's (root mean square)"
+        try:
+            measured = with_levels(chip, traced.level_px)
+            for name, place in (("start", config.mission.start), ("goal", config.mission.goal)):
+                check_point(measured, place, name, config.robot.radius_um)
+            chip = measured
+            found.append(walls)
+        except (ChipError, FlowError) as error:
+            found.append(f"{walls}, which are kept ({error})")
+    if not found:
+        return config, chip, "the image shows the chip where registration and mask have it"
+    return config, chip, f"{'; '.join(found)}: taken from the image"
+
+
+def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls | None:
+    """Trace the walls of a chip in a picture (h, w), which shows it about as a registration states.
+
+    None if the picture does not show them.
+    """
+    if not is_legible(picture, chip):
+        return None
+    contours = _Contours.of(chip)
+    found = _follow(picture, contours, stated, sided=False)
+    if found is None or found.sided > _SIDED:  # scale and place may be farther off than walls are sought
+        nearby = fit_nearby(picture, chip, stated)
+        if nearby is None:
+            return None
+        found = _follow(picture, contours, nearby.calibration, sided=False)
+        if found is None or found.sided > _SIDED:
+            found = _follow(picture, contours, nearby.calibration, sided=True)
+    if found is None:
+        return None
+    calibration, out_px, like, _ = found
+    points_um = contours.points * chip.um_per_px
+    off = calibration.to_px(points_um) - stated.to_px(points_um)
+    seen = like >= _LIKE
+    return TracedWalls(
+        calibration,
+        float(np.sqrt((off**2).sum(axis=1).mean())),
+        contours.levels(out_px),
+        float(np.sqrt((out_px[seen] ** 2).mean())),
+        float(np.nanmedian(like)),
+    )
+
+
+class _Contours(NamedTuple):
+    """Points on the walls of a mask, a pixel apart, in order along each wall."""
+
+    chip: Chip
+    points: Floats  # (n, 2) x, y in px of the mask
+    inward: Floats  # (n, 2) unit normals, into the fluid
+    walls: list[tuple[slice, bool]]  # the points of each wall, and whether it is closed
+    inside: Bools  # (n,) away from the border of the mask
+
+    @classmethod
+    def of(cls, chip: Chip) -> _Contours:
+        points: list[Floats] = []
+        walls: list[tuple[slice, bool]] = []
+        first = 0
+        for contour, closed in smooth_contours(chip.mask):
+            each = _evenly(contour, closed, 1.0)
+            points.append(each)
+            walls.append((slice(first, first + len(each)), closed))
+            first += len(each)
+        every = np.concatenate(points) if points else np.zeros((0, 2))
+        size = np.array(chip.mask.shape[::-1])
+        border = np.minimum(every + 0.5, size - 0.5 - every).min(axis=1, initial=math.inf)
+        inward = np.concatenate([_normals(every[which], closed) for which, closed in walls] or [every])
+        return cls(chip, every, inward, walls, border > _BORDER_PX)
+
+    def along(self, values: Floats, sigma_px: float) -> Floats:
+        """Values (n, ...) of the points, averaged along each wall."""
+        averaged = np.empty_like(values)
+        for which, closed in self.walls:
+            mode = "wrap" if closed else "nearest"
+            averaged[which] = scipy.ndimage.gaussian_filter1d(values[which], sigma_px, axis=0, mode=mode)
+        return averaged
+
+    def levels(self, out_px: Floats) -> Floats32:
+        """(h, w) signed distances of the pixel centres to the walls, each moved outwards by (n,)."""
+        moved = self.points - out_px[:, None] * self.inward
+        dense = [(_evenly(moved[which], closed, 1.0 / _DENSE), closed) for which, closed in self.walls]
+        points = np.concatenate([each for each, _ in dense])
+        inward = np.concatenate([_normals(each, closed) for each, closed in dense])
+        mask = self.chip.mask
+        rows, columns = np.indices(mask.shape)
+        centres = np.stack((columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+        distance, nearest = scipy.spatial.cKDTree(points).query(centres, distance_upper_bound=_REACH_PX)
+        near = np.isfinite(distance)
+        level = np.where(mask.ravel(), _REACH_PX, -_REACH_PX)
+        across = (centres[near] - points[nearest[near]]) * inward[nearest[near]]
+        level[near] = np.copysign(distance[near], across.sum(axis=1))
+        return np.asarray(level.reshape(mask.shape), np.float32)
+
+
+def _evenly(contour: Floats, closed: bool, step_px: float) -> Floats:
+    """Points (m, 2) a step apart along a contour (n, 2)."""
+    line = np.concatenate([contour, contour[:1]]) if closed else contour
+    at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    count = max(round(float(at[-1]) / step_px), 2)
+    places = np.linspace(0.0, at[-1], count, endpoint=not closed)
+    return np.stack([np.interp(places, at, line[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _normals(points: Floats, closed: bool) -> Floats:
+    """(n, 2) unit normals of a contour to its right, where the fluid is."""
+    smooth = scipy.ndimage.gaussian_filter1d(points, _ALONG_PX, axis=0, mode="wrap" if closed else "nearest")
+    along = np.roll(smooth, -1, 0) - np.roll(smooth, 1, 0) if closed else np.gradient(smooth, axis=0)
+    right = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    return np.asarray(right / np.maximum(np.hypot(*along.T), 1e-9)[:, None])
+
+
+class _Followed(NamedTuple):
+    """Walls and pose near a first one."""
+
+    calibration: Calibration
+    out_px: Floats  # (n,) how far out each wall is
+    like: Floats  # (n,) correlation with the common profile; NaN beside the picture
+    sided: float  # size of the profiles' b and c over that of a
+
+
+def _follow(picture: Image, contours: _Contours, start: Calibration, sided: bool) -> _Followed | None:
+    """Walls and pose near a first one, in light from one side or not; None if too few of the walls look alike."""
+    chip = contours.chip
+    width_px = median_width_um(chip) / chip.um_per_px
+    calibration, image = start, level_contrast(np.asarray(picture, np.float32), _blur_px(width_px, chip, start))
+    window = round(float(np.clip(_WINDOW_WIDTHS * width_px, *_WINDOW_PX)) / _STEP_PX)
+    places = np.arange(-math.ceil(_IN_WIDTHS * width_px / _STEP_PX), math.ceil(_OUT_PX / _STEP_PX) + 1)
+    out_px = np.zeros(len(contours.points))
+    for _ in range(_ROUNDS):
+        profiles = _profiles(image, contours, calibration, places, window)
+        usable = contours.inside & np.isfinite(profiles).all(axis=1)
+        if np.count_nonzero(usable) < _LEAST_WALL_PX or not profiles[usable].std() > 0.0:
+            return None
+        present = np.clip(np.rint(out_px / _STEP_PX).astype(np.intp) - places[0], 0, len(places) - 1)
+        towards = (calibration.axes @ contours.inward.T).T  # where the fluid lies, in the image
+        at_walls = _windows(profiles, window)[np.arange(len(present)), present]
+        expected, share = _expected(at_walls, towards, usable, sided)
+        likeness = _likeness(profiles, expected, usable)
+        out_px = _move_walls(likeness, usable, places, contours)
+        best = np.clip(np.rint(out_px / _STEP_PX).astype(np.intp) - places[0], 0, len(places) - 1)
+        like = np.where(usable, likeness[np.arange(len(best)), best], np.nan)
+        if np.count_nonzero(like >= _LIKE) < _LEAST_WALL_PX:
+            return None
+        calibration, out_px, moved_px = _move_pose(calibration, contours, out_px, like >= _LIKE)
+        if moved_px < _STILL_PX:
+            break
+    seen = like >= _LIKE
+    plausible = np.mean(seen[usable]) >= _LEAST_SEEN and np.sqrt((out_px[seen] ** 2).mean()) <= _MOST_WALL_PX
+    if not plausible:
+        return None
+    aside_px = _aside(expected)
+    if abs(aside_px) > _ASIDE_PX:
+        out_px = np.where(contours.inside, out_px + aside_px, 0.0)
+    return _Followed(calibration, out_px, like, share)
+
+
+def _aside(expected: NDArray[np.float32]) -> float:
+    """How far outwards of the present walls their profiles (n, m) are steep: the mean place by the squared slope."""
+    steep = (np.diff(expected, axis=1) ** 2).sum(axis=0)
+    places = _STEP_PX * (np.arange(len(steep)) - 0.5 * (len(steep) - 1))
+    return float((steep * places).sum() / max(float(steep.sum()), 1e-9))
+
+
+def _blur_px(width_px: float, chip: Chip, start: Calibration) -> float:
+    """Size in the image of what counts as slow variation of the light: beyond a channel's width."""
+    return max(1.2 * width_px * chip.um_per_px / start.um_per_px, 12.0)
+
+
+def _profiles(
+    image: Levels, contours: _Contours, calibration: Calibration, places: Ints, window: int
+) -> NDArray[np.float32]:
+    """(n, m) grey levels across the walls, outwards: a window before the first place to one after the last.
+
+    NaN beside the image.
+    """
+    out_px = _STEP_PX * np.arange(places[0] - window, places[-1] + window + 1)
+    at_um = (contours.points[:, None] - out_px[None, :, None] * contours.inward[:, None]) * contours.chip.um_per_px
+    at_px = calibration.to_px(at_um).astype(np.float32)
+    columns, rows = (np.ascontiguousarray(at_px[..., axis]) for axis in (0, 1))
+    seen = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan)
+    return np.asarray(contours.along(np.asarray(seen, np.float64), _ALONG_PX), np.float32)
+
+
+def _windows(profiles: NDArray[np.float32], window: int) -> NDArray[np.float32]:
+    """(n, places, 2 window + 1) the part of profiles (n, m) around each place."""
+    return np.lib.stride_tricks.sliding_window_view(profiles, 2 * window + 1, axis=1)
+
+
+def _expected(
+    present: NDArray[np.float32], towards: Floats, usable: Bools, sided: bool
+) -> tuple[NDArray[np.float32], float]:
+    """(n, m) the common profile at each wall, of mean 0, and the size of its b and c over that of its a.
+
+    Parameters
+    ----------
+    present : (n, m) profiles where the walls are taken to be.
+    towards : (n, 2) unit vectors into the fluid, in the image.
+    sided : b and c are part of the profile.
+    """
+    now = present - present.mean(axis=1, keepdims=True)
+    directions = np.column_stack([np.ones(len(towards)), towards])
+    chosen = usable
+    for _ in range(2):  # the second time without those that look different
+        common, *_ = np.linalg.lstsq(directions[chosen], now[chosen], rcond=None)
+        off = np.sqrt(((now - directions @ common) ** 2).mean(axis=1))
+        chosen = usable & (off <= 2.0 * np.median(off[usable]))
+    share = float(np.linalg.norm(common[1:])) / max(float(np.linalg.norm(common[0])), 1e-9)
+    expected = directions @ common if sided else np.tile(common[0], (len(now), 1))
+    return np.asarray(expected - expected.mean(axis=1, keepdims=True), np.float32), share
+
+
+def _likeness(profiles: NDArray[np.float32], expected: NDArray[np.float32], usable: Bools) -> Floats:
+    """(n, places) correlation of profiles (n, m) around each place with the expected one (n, 2 window + 1)."""
+    length = expected.shape[1]
+    around = _windows(profiles, length // 2)
+    power = np.maximum(_windows(profiles**2, length // 2).mean(axis=-1) - around.mean(axis=-1) ** 2, 0.0)
+    size = np.sqrt((expected**2).mean(axis=1))[:, None]
+    both = np.einsum("npu,nu->np", around, expected) / length
+    faint = _FAINT * float(np.median(np.sqrt(power[usable].max(axis=1)))) + 1e-9
+    return np.asarray(both / np.maximum(np.sqrt(power), faint) / np.maximum(size, 1e-9), np.float64)
+
+
+def _move_walls(likeness: Floats, usable: Bools, places: Ints, contours: _Contours) -> Floats:
+    """(n,) px by which each wall moves outwards."""
+    cost = np.where(usable[:, None], 1.0 - likeness, 1.0) + _REST * np.abs(_STEP_PX * places)
+    cost[~contours.inside] = np.abs(_STEP_PX * places)
+    out_px = np.zeros(len(cost))
+    for which, closed in contours.walls:
+        each = cost[which]
+        chosen = np.clip(_cheapest(each, closed), 1, len(places) - 2)
+        before, here, after = (each[np.arange(len(chosen)), chosen + step] for step in (-1, 0, 1))
+        part = np.clip(0.5 * (before - after) / np.maximum(before - 2.0 * here + after, 1e-6), -1.0, 1.0)
+        out_px[which] = _STEP_PX * (places[chosen] + part)
+    return np.where(contours.inside, contours.along(out_px, 0.7 * _ALONG_PX), 0.0)
+
+
+def _cheapest(cost: Floats, closed: bool) -> Ints:
+    """(n,) places along a wall with the least sum of costs (n, places), and of differences between neighbours."""
+    again = min(len(cost), round(0.25 * len(cost)) + 2 * _STEPS_ALONG) if closed else 0
+    line = np.concatenate([cost[len(cost) - again :], cost, cost[:again]]) if again else cost
+    steps = np.arange(-_STEPS_ALONG, _STEPS_ALONG + 1)
+    stiff = (_STIFFNESS * (_STEP_PX * steps) ** 2)[:, None]
+    total, came = line[0], np.zeros(line.shape, np.intp)
+    for number in range(1, len(line)):
+        padded = np.pad(total, _STEPS_ALONG, constant_values=np.inf)
+        options = np.lib.stride_tricks.sliding_window_view(padded, line.shape[1]) + stiff
+        came[number] = options.argmin(axis=0)
+        total = options.min(axis=0) + line[number]
+    path = np.empty(len(line), np.intp)
+    path[-1] = int(total.argmin())
+    for number in range(len(line) - 1, 0, -1):
+        path[number - 1] = path[number] + steps[came[number, path[number]]]
+    return path[again : again + len(cost)]
+
+
+def _move_pose(
+    calibration: Calibration, contours: _Contours, out_px: Floats, seen: Bools
+) -> tuple[Calibration, Floats, float]:
+    """The pose that leaves the walls least out (n,) px, what then is left, and how far it moves walls, in px."""
+    points, inward = contours.points, contours.inward
+    arm = points - points.mean(axis=0)
+    reach = max(float(np.hypot(*arm.T).mean()), 1.0)
+    turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    # The last unknown moves all walls outwards alike. Where on its profile a wall is, no picture tells: the mask does.
+    design = -np.column_stack(
+        [inward, (turned * inward).sum(axis=1) / reach, (arm * inward).sum(axis=1) / reach, -np.ones(len(points))]
+    )
+    weight = seen.astype(np.float64)
+    for _ in range(10):  # Cauchy's weights: a blocked branch is no motion of the chip
+        root = np.sqrt(weight)[:, None]
+        move, *_ = np.linalg.lstsq(root * design, root[:, 0] * out_px, rcond=_UNKNOWN)
+        left = out_px - design @ move
+        scale = 1.48 * float(np.median(np.abs(left[seen]))) + 1e-6
+        weight = seen / (1.0 + (left / (2.0 * scale)) ** 2)
+    px = contours.chip.um_per_px
+    middle_um = px * points.mean(axis=0)
+    middle_px, per = calibration.to_px(middle_um), px / calibration.um_per_px
+    shift_px = calibration.to_px(middle_um + px * move[:2]) - middle_px
+    turn = -move[2] if calibration.mirror else move[2]
+    moved = move_chip(calibration, np.array([*shift_px, per * turn, per * move[3]]), middle_px, per * reach)
+    return moved, left, float(np.abs(move[:4]).max())

@@ -1,0 +1,163 @@
+"""One picture tells where a chip lies and where its walls are; pictures by another renderer than the microscope's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from flowrec.measure.wall_trace import as_pictured, trace_walls
+from flowrec.physics import Calibration, ChipSettings, load_chip, with_wall_offset
+from flowrec.physics.flow.level_set import from_mask
+from flowrec.rigs.simulated.true_walls import true_walls
+from flowrec.stages import load_config, registration_of, resolve
+from tests.physics.chip.looks import LOOKS, picture
+
+SIZE_PX = (640, 512)
+BIFURCATION, STRAIGHT = (load_chip(ChipSettings(name)) for name in ("bifurcation", "straight"))
+VESSELS = load_chip(ChipSettings("vessels", seed=3))
+LOOK = pytest.mark.slow("traces a picture that differs in its looks only")
+
+
+def levels(mask):
+    """Signed distance of the pixel centres to the walls, in px."""
+    return from_mask(mask, 2, "smooth").level[2::4, 2::4]
+
+
+class Scene:
+    """A chip whose walls are up to `error_px` off, with a blocked branch, in an image that is not as stated."""
+
+    def __init__(self, chip, look, error_px, um_per_px=1.006, shift_um=(12.0, -9.0), angle_deg=0.25, mirror=False):
+        rng = np.random.default_rng(7)
+        blocked = 0.35 if error_px else 0.0
+        self.chip, self.true = chip, true_walls(chip, error_px, blocked, np.zeros((0, 2)), rng)[0]
+        self.first_um = 0.5 * (self.true.um_per_px - chip.um_per_px)
+        size_um = np.array(chip.size_um)
+        scale_um, middle_um = 1.02 * float(max(size_um / SIZE_PX)), 0.5 * (size_um - chip.um_per_px)
+        self.stated = Calibration.centre_on(scale_um, middle_um, SIZE_PX, 0.0, mirror)
+        self.camera = Calibration.centre_on(um_per_px * scale_um, middle_um + shift_um, SIZE_PX, angle_deg, mirror)
+        x_um, y_um = self.camera.origin_um
+        of_true = replace(self.camera, origin_um=(x_um - self.first_um, y_um - self.first_um))
+        self.image = picture(
+            self.true.mask, self.true.um_per_px, of_true, SIZE_PX, LOOKS[look], np.random.default_rng(4)
+        )
+
+    def off_um(self, calibration):
+        """Root mean square error of a registration over the channels."""
+        places = np.argwhere(self.chip.mask)[::37, ::-1] * self.chip.um_per_px
+        return float(np.sqrt(((calibration.to_um(self.camera.to_px(places)) - places) ** 2).sum(axis=1).mean()))
+
+    def wall_errors_px(self, level_px, calibration):
+        """Errors of the levels of pixels beside the true walls, where the camera sees them."""
+        h, w = self.chip.mask.shape
+        rows, columns = np.nonzero(np.abs(level_px) < 0.7)
+        away = np.minimum.reduce([rows, columns, h - 1 - rows, w - 1 - columns]) > 3
+        px = self.chip.um_per_px
+        at_um = self.camera.to_um(calibration.to_px(np.stack((columns, rows), axis=-1) * px))
+        at = (at_um - self.first_um) / self.true.um_per_px
+        fine = levels(self.true.mask) * self.true.um_per_px / px
+        true = map_coordinates(fine, at[:, ::-1].T, order=1, mode="nearest")
+        near = away & (np.abs(true) < 0.6)
+        return level_px[rows, columns][near] - true[near]
+
+
+@pytest.mark.parametrize(
+    ("chip", "look", "most_px"),
+    [
+        (BIFURCATION, "dirty", 0.25),
+        (BIFURCATION, "relief", 0.3),
+        *(
+            pytest.param(chip, look, 0.35, marks=LOOK)
+            for chip in (BIFURCATION, VESSELS)
+            for look in ("dark lines", "thin bright lines", "phase edges", "dye", "ink", "uneven", "noisy", "relief")
+        ),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_walls_that_are_off_the_mask_and_the_pose_are_found_whatever_walls_look_like(chip, look, most_px):
+    scene = Scene(chip, look, 0.8)
+    found = trace_walls(scene.image, chip, scene.stated)
+    assert scene.off_um(scene.stated) > 14.0
+    assert scene.off_um(found.calibration) < 4.0
+    drawn = np.std(scene.wall_errors_px(levels(chip.mask), scene.stated))
+    assert np.std(scene.wall_errors_px(found.level_px, found.calibration)) < min(most_px, 0.75 * drawn)
+
+
+@pytest.mark.parametrize("offset_px", [-1.0, 1.0])
+def test_a_mask_that_is_too_narrow_or_too_wide_everywhere_is_corrected(offset_px):
+    scene = Scene(BIFURCATION, "ink", 0.0, um_per_px=1.0, shift_um=(0.0, 0.0), angle_deg=0.0)
+    drawn = replace(with_wall_offset(BIFURCATION, offset_px), drawn=None, wall_offset_px=0.0)
+    found = trace_walls(scene.image, drawn, scene.stated)
+    beside = np.abs(levels(BIFURCATION.mask)) < 0.6
+    beside[:4] = beside[-4:] = beside[:, :4] = beside[:, -4:] = False
+    right, wrong = levels(BIFURCATION.mask), levels(drawn.mask)
+    assert abs((wrong - right)[beside].mean()) > 0.6
+    assert abs((found.level_px - right)[beside].mean()) < 0.15
+
+
+def test_the_pose_in_a_mirror_image_is_found():
+    scene = Scene(BIFURCATION, "dark lines", 0.0, mirror=True)
+    assert scene.off_um(trace_walls(scene.image, BIFURCATION, scene.stated).calibration) < 1.5
+
+
+def test_a_scale_that_is_three_percent_off_is_found():
+    scene = Scene(BIFURCATION, "dark lines", 0.0, um_per_px=0.97)
+    assert scene.off_um(trace_walls(scene.image, BIFURCATION, scene.stated).calibration) < 1.5
+
+
+def test_along_a_straight_channel_the_chip_stays_where_it_is_stated():
+    scene = Scene(STRAIGHT, "dark lines", 0.0, um_per_px=1.0, shift_um=(90.0, 9.0), angle_deg=0.0)
+    found = trace_walls(scene.image, STRAIGHT, scene.stated).calibration
+    middle = 0.5 * (np.array(SIZE_PX) - 1.0)
+    along_um, across_um = found.to_um(middle) - scene.stated.to_um(middle)
+    assert abs(along_um) < 1.0
+    assert across_um == pytest.approx(9.0, abs=1.0)
+    assert found.um_per_px == pytest.approx(scene.stated.um_per_px, rel=2e-3)
+
+
+NOISE = np.random.default_rng(0).normal(0.0, 1.0, SIZE_PX[::-1])
+SMOOTH = map_coordinates(NOISE[::8, ::8], np.indices(SIZE_PX[::-1]) / 8.0, order=3, mode="nearest")
+RIGHT = Scene(BIFURCATION, "dark lines", 0.0).image
+PICTURES = {
+    "noise": 128.0 + 20.0 * NOISE,
+    "blurred noise": 128.0 + 40.0 * SMOOTH,
+    "light from the left": np.tile(np.linspace(60.0, 200.0, SIZE_PX[0]), (SIZE_PX[1], 1)),
+    "another chip": Scene(VESSELS, "dark lines", 0.0).image.astype(np.float64),
+    "upside down": RIGHT[::-1].astype(np.float64),
+    "half hidden": np.where(np.arange(SIZE_PX[0]) < SIZE_PX[0] // 2, 128.0 + 8.0 * NOISE, RIGHT),
+}
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [
+        *("blurred noise", "another chip", "half hidden"),
+        *(pytest.param(each, marks=LOOK) for each in ("noise", "light from the left", "upside down")),
+    ],
+)
+def test_a_picture_that_does_not_show_the_chip_changes_nothing(shown):
+    config = resolve(load_config(None, []), BIFURCATION)
+    image = PICTURES[shown].clip(0.0, 255.0).astype(np.uint8)
+    kept, chip, said = as_pictured(config, BIFURCATION, image)
+    assert kept is config
+    assert chip is BIFURCATION
+    assert "does not show the walls" in said
+
+
+def test_a_right_mask_stays_as_it_is_in_a_picture_out_of_focus_and_in_a_clear_one():
+    config = resolve(load_config(None, []), BIFURCATION)
+    camera = registration_of(config.camera, BIFURCATION)
+    for look in ("out of focus", "noisy", "dark lines"):
+        image = picture(BIFURCATION.mask, BIFURCATION.um_per_px, camera, SIZE_PX, LOOKS[look], np.random.default_rng(4))
+        assert as_pictured(config, BIFURCATION, image)[1] is BIFURCATION
+
+
+def test_a_goal_in_a_wall_of_the_picture_keeps_the_mask():
+    scene = Scene(BIFURCATION, "dark lines", 0.8)
+    config = resolve(load_config(None, []), BIFURCATION)
+    x, y = np.argwhere((levels(BIFURCATION.mask) > 0.0) & (levels(scene.true.mask)[::2, ::2] < -0.5))[0][::-1]
+    place = (float(x) * BIFURCATION.um_per_px, float(y) * BIFURCATION.um_per_px)
+    blocked = replace(config, mission=replace(config.mission, goal=place))
+    _, chip, said = as_pictured(blocked, BIFURCATION, scene.image)
+    assert chip is BIFURCATION
+    assert "goal" in said
