@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from flowrec.core.messages import Observations
+from flowrec.physics import with_levels
 from flowrec.physics.chip.clearance import clearance_um
 from flowrec.physics.flow.sampling import sample
 from flowrec.stages.refine import Assimilate, Refiner
@@ -250,3 +251,17 @@ def test_robots_leave_their_courses_each_for_itself(twin):
     (others,) = effects["gain of others"].columns
     assert not others[:40].any() and others[40:].any()
     assert "height" not in effects
+
+
+def test_walls_and_registration_of_an_image_leave_less_doubt_about_both_and_as_much_about_the_robot(twin):
+    case = twin()
+    level_px = np.clip(clearance_um(case.chip.mask, 1.0), -2.5, 2.5)
+    settings, sizes = Assimilate(), []
+    for chip in (case.chip, with_levels(case.chip, level_px)):
+        model = flow_model(settings, settings.model, chip, case.solver)
+        operator = observation_operator(flown(case), chip.mask, chip.um_per_px, case.assumed.wall_px)
+        sizes.append({each.name: each.median for each in Observed.of(model, operator).effects(model.base, None)})
+    drawn, pictured = sizes
+    doubted_less = {name for name in drawn if pictured[name] < 0.5 * drawn[name]}
+    assert doubted_less == {"walls", "resistance", "offset", "scale", "angle"}
+    assert all(pictured[name] == pytest.approx(drawn[name]) for name in ("boundary", "gain", "heading", "fluid"))
