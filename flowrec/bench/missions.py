@@ -23,7 +23,7 @@ import typer
 from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import FigureFile, Results, choose_names, paired_ratio, print_rows, vessel_cases, wilson
 from flowrec.bench.world_flights import WORLDS as FAULTS
-from flowrec.bench.world_flights import Given, in_world
+from flowrec.bench.world_flights import Given, as_seen, in_world
 from flowrec.core import (
     Currents,
     Floats,
@@ -274,8 +274,8 @@ def fly(
     name += " slowed" if asked.chip.path and asked.chip.inlet_speed_um_s is not None else ""
     try:
         config, chip = in_world(WORLDS[world.name], list(WORLDS).index(world.name), seed, sets)
-        pipeline = assemble(config, chip)
-        rig = SimulatedRig.of(pipeline, config)
+        rig = SimulatedRig.of(assemble(config, chip), config)
+        pipeline, _ = as_seen(config, chip, rig)
         truth = rig.true_world().field
     except FlowrecError as error:  # before anything is switched on
         return Row(world.name, seed, name, way, known, policy, "refused", str(error))

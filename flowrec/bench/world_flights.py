@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,10 +29,12 @@ from flowrec.core import (
     Phase,
     Tick,
     WorkOrder,
+    cells_at,
     message_fields,
     seconds,
 )
-from flowrec.physics import Chip, load_chip
+from flowrec.measure import as_pictured
+from flowrec.physics import Chip, load_chip, sample
 from flowrec.rigs import SimulatedRig
 from flowrec.run import LockstepWorker, run, work
 from flowrec.stages import (
@@ -215,8 +216,8 @@ def fly(case: FlightCase) -> Flight:
     except FlowrecError as error:
         flight.note = str(error)
         return flight
-    pipeline = assemble(config, chip)
-    rig = SimulatedRig.of(pipeline, config)
+    rig = SimulatedRig.of(assemble(config, chip), config)
+    pipeline = as_seen(config, chip, rig)[0]
     orders: list[Tick] = []
 
     def watch(tick: Tick) -> None:
@@ -268,12 +269,41 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
 
 def _problem_of_flight(flight: Flight) -> Judged:
     config, chip = prepare_case(FlightCase(flight.world, flight.chip, flight.seed, flight.sets))
-    pipeline = assemble(config, chip)
-    truth = SimulatedRig.of(pipeline, config).true_world().field.velocity_um_s * np.float32(flight.drift)
+    rig = SimulatedRig.of(assemble(config, chip), config)
+    truth = rig.true_world().field.velocity_um_s * np.float32(flight.drift)
+    pipeline, place = as_seen(config, chip, rig)
     order = _order_of(flight, pipeline)
     assert order.assumed is not None and order.observations is not None
-    by = partial(_refine_order, order, pipeline, config, chip)
-    return Judged(order.assumed, by, truth, chip.mask, planted_causes(config, chip), order.observations.position_um)
+
+    def refine_by(method: str) -> FlowField:
+        return place(_refine_order(order, pipeline, config, pipeline.chip, method))
+
+    seen_um = order.observations.position_um
+    return Judged(place(order.assumed), refine_by, truth, chip.mask, planted_causes(config, chip), seen_um)
+
+
+def as_seen(config: ResolvedConfig, chip: Chip, rig: SimulatedRig) -> tuple[Pipeline, Callable[[FlowField], FlowField]]:
+    """The stages, with the walls of the rig's image where they are asked for; and a map as the truth has its places.
+
+    The frame of a chip is that of its registration: maps are compared where the camera sees them.
+    """
+    if not config.camera.trace_walls:
+        return assemble(config, chip), lambda found: found
+    pipeline = assemble(*as_pictured(config, chip, rig.picture())[:2])
+    rows, columns = np.indices(chip.mask.shape)
+    in_image = rig.calibration.to_px(np.stack((columns, rows), axis=-1) * chip.um_per_px)
+    seen = pipeline.calibration
+    turn = rig.calibration.um_per_px / seen.um_per_px * rig.calibration.axes.T @ seen.axes
+    at_px = seen.to_um(in_image) / chip.um_per_px
+
+    def place(found: FlowField) -> FlowField:
+        cells = cells_at(at_px.reshape(-1, 2), chip.mask.shape)
+        velocity = sample(found, at_px * chip.um_per_px) @ turn.T
+        std = None if found.std_um_s is None else cells.interpolate(found.std_um_s).reshape(velocity.shape)
+        std_um_s = None if std is None else std.astype(np.float32)
+        return replace(found, velocity_um_s=velocity.astype(np.float32), std_um_s=std_um_s, wall_px=None)
+
+    return pipeline, place
 
 
 def _problem_of_survey(flight: Flight) -> Judged:

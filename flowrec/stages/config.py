@@ -174,6 +174,7 @@ _BEFORE: dict[str, Any] = {
     "health.step_out.learned": False,
     "health.step_out.least_gain": -0.5,
     "sampler.without_map": False,
+    "camera.trace_walls": False,
     "others.observe_flow": False,
     "tracker.tracer.most_elongated": 0.0,
     "refine.place_robot": False,

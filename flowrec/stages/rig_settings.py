@@ -63,6 +63,8 @@ class CameraSettings:
     angle_deg: Angle = 0.0  # direction of the chip's x axis in the image: 0 right, 90 down
     mirror: bool = False  # the image shows the chip as in a mirror
     centre_um: PointUm | None = None  # chip point at the centre of the image; None: the centre of the chip
+    # walls and registration of the first image, where it shows them, in place of those stated
+    trace_walls: bool = True
     # Stated by the file of a registration: when it was measured, in which picture, and how far the walls in the
     # picture are from where it puts them (root mean square).
     registered_on: str = ""

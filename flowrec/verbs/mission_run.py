@@ -18,6 +18,7 @@ from flowrec.core import (
     Coverage,
     Figures,
     FlowrecError,
+    Image,
     Outcome,
     Output,
     SessionError,
@@ -30,6 +31,7 @@ from flowrec.core import (
     say,
     warn,
 )
+from flowrec.measure import as_pictured
 from flowrec.rigs import Connecting, MovieRig, Picturing, Rig, RunLog
 from flowrec.run import (
     CommandSocket,
@@ -48,7 +50,7 @@ from flowrec.run import (
     obey,
     run,
 )
-from flowrec.stages import MOVIE, RIGS, Config, RunStatistics, extra_rows, shortest_way
+from flowrec.stages import MOVIE, RIGS, Config, RunStatistics, assemble, extra_rows, shortest_way
 from flowrec.store import SessionWriter, session_writer
 from flowrec.verbs.admission import admit, rehearse_aloud
 from flowrec.verbs.interactive import Unattended
@@ -191,9 +193,13 @@ class _Mission:
         if self._streams is not None:
             setting = "pump.inlets" if config.pump.inlets else "pump.channel"
             self._streams.connect(stack, dict.fromkeys(config.pump.channels, setting))
-        if isinstance(rig, Picturing) and config.mission.check_axes:
-            verdict = checked_image(rig.picture(), config, chip, "camera")
+        if isinstance(rig, Picturing) and (config.mission.check_axes or config.camera.trace_walls):
+            picture = rig.picture()
+            verdict = checked_image(picture, config, chip, "camera")
             self._source |= {"source_axes": verdict.text} if verdict is not None else {}
+            if config.camera.trace_walls:
+                self._take_walls(picture)
+                config, chip = self._config, self._chip
         tried = self._realtime and config.recording.admission_s > 0.0
         if tried:
             say("getting ready: methods, first flow, trial of the camera")
@@ -206,6 +212,16 @@ class _Mission:
             scene = config, chip, pipeline
             self._source |= admit(rig, worker, scene, self._fields, self._folder, self.run_control)
         self._worker = Preloaded(worker, self._fields) if self._fields else worker
+
+    def _take_walls(self, picture: Image) -> None:
+        """Let the stages, but not the rig, have the registration and the walls of the camera's picture (h, w)."""
+        config, chip, found = as_pictured(self._config, self._chip, picture)
+        if config is not self._config or chip is not self._chip:
+            self._config, self._chip, self._pipeline = config, chip, assemble(config, chip)
+            self._judges = judges_of(self._pipeline)
+        if found:
+            self._source["source_walls"] = found
+            say(f"camera: {found}")
 
     def refuse_stopped(self) -> None:
         """Raise FlowrecError, with the status of a stop, where the run was stopped before it had a file."""

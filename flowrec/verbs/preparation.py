@@ -22,7 +22,7 @@ from flowrec.core import (
     say,
     warn,
 )
-from flowrec.measure import ImageVerdict, WallsState, orientation_by_image, walls_state
+from flowrec.measure import ImageVerdict, WallsState, as_pictured, orientation_by_image, walls_state
 from flowrec.physics import Chip, load_chip, median_width_um, sample
 from flowrec.rigs import fitted_to_movie, open_source
 from flowrec.run import refuse_below
@@ -98,6 +98,13 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
         image, walls = (known.image, known.walls) if known is not None else _looked_at(config, chip)
         if image is not None:
             facts["source_axes"] = image.text
+        if config.camera.trace_walls:
+            picture, walls = _picture_of(config), None
+            if picture is not None:
+                config, chip, shown = as_pictured(config, chip, picture)
+                if shown:
+                    facts["source_walls"] = shown
+                    tell(f"{config.movie.path}: {shown}")
         if walls is not None and not walls.good:
             caution(walls.text)
             facts["source_walls"] = walls.text
@@ -131,13 +138,20 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
 
 def _looked_at(config: ResolvedConfig, chip: Chip) -> tuple[ImageVerdict | None, WallsState | None]:
     """Verdict of a movie on the axes, and that of its walls on the registration."""
-    try:
-        with open_source(config.movie) as movie:
-            image = movie.median_image()
-    except MovieError:  # an image can not be read: the run tells that
+    image = _picture_of(config)
+    if image is None:
         return None, None
     verdict = checked_image(image, config, chip, config.movie.path)
     return verdict, walls_state(image, chip, registration_of(config.camera, chip))
+
+
+def _picture_of(config: ResolvedConfig) -> Image | None:
+    """The median (h, w) of images of a movie; None if they can not be read, which the run tells."""
+    try:
+        with open_source(config.movie) as movie:
+            return movie.median_image()
+    except MovieError:
+        return None
 
 
 def checked_image(image: Image, config: ResolvedConfig, chip: Chip, where: str) -> ImageVerdict | None:

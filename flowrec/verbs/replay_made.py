@@ -118,6 +118,12 @@ def _fly_plan(done: Replay, name: str, start_um: tuple[float, float], out: Outpu
         wait_at_goal_s=0.0,
     )
     flown = replace(config, mission=mission)
+    if config.camera.trace_walls:  # the registration was measured: it is that of the world
+        seen = config.camera
+        simulated = replace(
+            config.simulated, um_per_px=seen.um_per_px, angle_deg=seen.angle_deg, centre_um=seen.centre_um
+        )
+        flown = replace(flown, simulated=simulated)
     pipeline = assemble(flown, session.chip)
     rig = SimulatedRig.of(pipeline, flown, true_field=done.recorded.true_field or done.replayed.field)
     known = {key: field for key in FLOW_FIELDS if (field := getattr(tick, key)) is not None}

@@ -159,7 +159,7 @@ class SimulatedRig:
         check_point(chip, start_um, "start", robot.radius_um)
         self._chip = chip
         self._robot = robot
-        self._calibration = calibration
+        self.calibration = calibration
         self._camera = camera
         self._simulated = simulated
         x, y = (float(value) for value in np.asarray(start_um, np.float64))
@@ -219,7 +219,7 @@ class SimulatedRig:
         return Microscope(
             world.mask,
             world.mask_um_per_px,
-            self._calibration,
+            self.calibration,
             self._camera,
             simulated.image,
             simulated.seed,
