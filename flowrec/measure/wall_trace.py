@@ -24,7 +24,7 @@ import scipy  # its ndimage and spatial load at first use, not at start-up
 from numpy.typing import NDArray
 
 from flowrec.core import Bools, ChipError, Floats, Floats32, FlowError, Image, Ints
-from flowrec.measure.images import Levels
+from flowrec.measure.images import Levels, shrink
 from flowrec.measure.picture_registration import fit_nearby, is_legible
 from flowrec.measure.wall_fit import level_contrast
 from flowrec.measure.wall_search import move_chip
@@ -43,6 +43,9 @@ _LIKE = 0.5  # correlation from which a wall counts as seen
 _SIDED = 0.2
 _FAINT = 0.3  # contrast of a profile, relative to the median, below which it shows no wall
 _BORDER_PX = 2.0  # from the border of the mask: openings keep their place
+# Walls that differ by less (root mean square) are those of the mask: so far a right one is taken off. In pixels of the
+# mask or, where those are larger, of the camera; so is the next one.
+_NOISE_PX = 0.15
 # All walls lie aside of the mask's from here on, as far as the middle of their steep profile; with a right mask that
 # is 0 to 0.4 px off, because some walls have a fringe on one side.
 _ASIDE_PX = 0.45
@@ -53,7 +56,6 @@ _LEAST_SEEN, _LEAST_WALL_PX, _MOST_WALL_PX = 0.9, 30, 1.5
 _UNKNOWN = 0.02  # motions that move walls by less, relative to the others, stay as stated: along a straight channel
 _REACH_PX = 6.0  # from a wall, up to which the side of it is that of the nearest point
 _DENSE = 8  # points of a wall per pixel, from which distances are taken
-_NOISE_PX = 0.15  # walls that differ by less (root mean square) are those of the mask: so far a right mask is taken off
 # Median correlation of a picture clear enough to correct a mask: of a right one, a trace in noise (correlation 0.86 to
 # 0.94) or out of focus (0.75 to 0.85) is 0.3 to 0.6 px off, of other looks (over 0.98) at most 0.14.
 _CLEAR = 0.96
@@ -61,18 +63,19 @@ _SAME_PX = 0.1  # of the camera: a pose that differs by less is the stated one
 
 
 class TracedWalls(NamedTuple):
-    """Where the walls are in a picture."""
+    """Places of the walls in a picture."""
 
     calibration: Calibration  # how the chip lies in the picture
     moved_px: float  # root mean square distance, in the picture's pixels, of the walls by it from the stated ones
     level_px: Floats32  # (h, w) signed distances of the mask's pixel centres to the walls
     wall_px: float  # root mean square distance of the walls from those of the mask, in its pixels
+    noise_px: float  # that of a right mask
     alike: float  # median correlation of a wall with the others
 
     @property
     def walls_differ(self) -> bool:
         """True if the mask differs from what the picture shows by more than the noise of a trace."""
-        return self.wall_px > _NOISE_PX and self.alike >= _CLEAR
+        return self.wall_px > self.noise_px and self.alike >= _CLEAR
 
     @property
     def chip_lies_elsewhere(self) -> bool:
@@ -143,6 +146,7 @@ def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls 
         float(np.sqrt((off**2).sum(axis=1).mean())),
         contours.levels(out_px),
         float(np.sqrt((out_px[seen] ** 2).mean())),
+        _NOISE_PX * max(1.0, calibration.um_per_px / chip.um_per_px),
         float(np.nanmedian(like)),
     )
 
@@ -227,19 +231,20 @@ def _follow(picture: Image, contours: _Contours, start: Calibration, sided: bool
     """Walls and pose near a first one, in light from one side or not; None if too few of the walls look alike."""
     chip = contours.chip
     width_px = median_width_um(chip) / chip.um_per_px
-    calibration, image = start, level_contrast(np.asarray(picture, np.float32), _blur_px(width_px, chip, start))
+    image, step = _level_picture(picture, chip, start, width_px)
+    calibration = start
     window = round(float(np.clip(_WINDOW_WIDTHS * width_px, *_WINDOW_PX)) / _STEP_PX)
     places = np.arange(-math.ceil(_IN_WIDTHS * width_px / _STEP_PX), math.ceil(_OUT_PX / _STEP_PX) + 1)
     out_px = np.zeros(len(contours.points))
     for _ in range(_ROUNDS):
-        profiles = _profiles(image, contours, calibration, places, window)
+        profiles = _profiles(image, step, contours, calibration, places, window)
         usable = contours.inside & np.isfinite(profiles).all(axis=1)
         if np.count_nonzero(usable) < _LEAST_WALL_PX or not profiles[usable].std() > 0.0:
             return None
         present = np.clip(np.rint(out_px / _STEP_PX).astype(np.intp) - places[0], 0, len(places) - 1)
         towards = (calibration.axes @ contours.inward.T).T  # where the fluid lies, in the image
         at_walls = _windows(profiles, window)[np.arange(len(present)), present]
-        expected, share = _expected(at_walls, towards, usable, sided)
+        expected, share = _expect_profiles(at_walls, towards, usable, sided)
         likeness = _likeness(profiles, expected, usable)
         out_px = _move_walls(likeness, usable, places, contours)
         best = np.clip(np.rint(out_px / _STEP_PX).astype(np.intp) - places[0], 0, len(places) - 1)
@@ -253,34 +258,40 @@ def _follow(picture: Image, contours: _Contours, start: Calibration, sided: bool
     plausible = np.mean(seen[usable]) >= _LEAST_SEEN and np.sqrt((out_px[seen] ** 2).mean()) <= _MOST_WALL_PX
     if not plausible:
         return None
-    aside_px = _aside(expected)
-    if abs(aside_px) > _ASIDE_PX:
+    aside_px = _steep_place(expected)
+    if abs(aside_px) > _ASIDE_PX * max(1.0, calibration.um_per_px / chip.um_per_px):
         out_px = np.where(contours.inside, out_px + aside_px, 0.0)
     return _Followed(calibration, out_px, like, share)
 
 
-def _aside(expected: NDArray[np.float32]) -> float:
-    """How far outwards of the present walls their profiles (n, m) are steep: the mean place by the squared slope."""
+def _steep_place(expected: NDArray[np.float32]) -> float:
+    """Distance in px from the present walls, outwards, to where profiles (n, m) are steep: a mean by squared slope."""
     steep = (np.diff(expected, axis=1) ** 2).sum(axis=0)
     places = _STEP_PX * (np.arange(len(steep)) - 0.5 * (len(steep) - 1))
     return float((steep * places).sum() / max(float(steep.sum()), 1e-9))
 
 
-def _blur_px(width_px: float, chip: Chip, start: Calibration) -> float:
-    """Size in the image of what counts as slow variation of the light: beyond a channel's width."""
-    return max(1.2 * width_px * chip.um_per_px / start.um_per_px, 12.0)
+def _level_picture(picture: Image, chip: Chip, start: Calibration, width_px: float) -> tuple[Levels, int]:
+    """A picture without its slow variation, with pixels of at most half the mask's, and how many of its own they are.
+
+    Slow is what is wider than a channel, `width_px` of the mask.
+    """
+    step = max(int(0.5 * chip.um_per_px / start.um_per_px), 1)
+    height, width = (n // step for n in picture.shape)
+    small = shrink(np.asarray(picture[: step * height, : step * width], np.float32), (width, height))
+    return level_contrast(small, max(1.2 * width_px * chip.um_per_px / (step * start.um_per_px), 12.0)), step
 
 
 def _profiles(
-    image: Levels, contours: _Contours, calibration: Calibration, places: Ints, window: int
+    image: Levels, step: int, contours: _Contours, calibration: Calibration, places: Ints, window: int
 ) -> NDArray[np.float32]:
     """(n, m) grey levels across the walls, outwards: a window before the first place to one after the last.
 
-    NaN beside the image.
+    `step` pixels of the camera are one of the image. NaN beside the image.
     """
     out_px = _STEP_PX * np.arange(places[0] - window, places[-1] + window + 1)
     at_um = (contours.points[:, None] - out_px[None, :, None] * contours.inward[:, None]) * contours.chip.um_per_px
-    at_px = calibration.to_px(at_um).astype(np.float32)
+    at_px = ((calibration.to_px(at_um) + 0.5) / step - 0.5).astype(np.float32)
     columns, rows = (np.ascontiguousarray(at_px[..., axis]) for axis in (0, 1))
     seen = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan)
     return np.asarray(contours.along(np.asarray(seen, np.float64), _ALONG_PX), np.float32)
@@ -291,7 +302,7 @@ def _windows(profiles: NDArray[np.float32], window: int) -> NDArray[np.float32]:
     return np.lib.stride_tricks.sliding_window_view(profiles, 2 * window + 1, axis=1)
 
 
-def _expected(
+def _expect_profiles(
     present: NDArray[np.float32], towards: Floats, usable: Bools, sided: bool
 ) -> tuple[NDArray[np.float32], float]:
     """(n, m) the common profile at each wall, of mean 0, and the size of its b and c over that of its a.

@@ -99,7 +99,9 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
         if image is not None:
             facts["source_axes"] = image.text
         if config.camera.trace_walls:
-            picture, walls = _picture_of(config), None
+            picture = _picture_of(config)
+            if walls is not None and not walls.other_scale:  # of another scale, mask or registration may be wrong
+                walls = None
             if picture is not None:
                 config, chip, shown = as_pictured(config, chip, picture)
                 if shown:

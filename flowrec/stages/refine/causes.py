@@ -285,16 +285,12 @@ class Observed:
             same = _of_components((here.tracer[:, None] == here.tracer) & (here.tracer >= 0.0))
             found.append(Effect("height", *HEIGHT, np.zeros((0, v.size)), v.ravel()[:, None] * v.ravel() * same))
         found += [_effect(name, (DISTURBED[0] * noise, DISTURBED[1]), every) for name, every in here.disturbances]
-        pictured = AS_PICTURED if model.chip.walls == "grey" else 1.0
-        return [
-            replace(
-                effect,
-                median=effect.median
-                * (self.usual if effect.name in _STATED else 1.0)
-                * (pictured if effect.name in _PICTURED else 1.0),
-            )
-            for effect in found
-        ]
+        return [replace(effect, median=self._usual_share(effect.name) * effect.median) for effect in found]
+
+    def _usual_share(self, name: str) -> float:
+        """Size of an effect over what is usual, before any observation."""
+        stated = self.usual if name in _STATED else 1.0
+        return stated * AS_PICTURED if name in _PICTURED and self.model.chip.walls == "grey" else stated
 
     def _transport_effects(self, v: Floats, flow: Floats) -> list[Effect]:
         """Effects of a flow (n, 2), which is v (n, 2) at the observations, on a robot of finite size."""
