@@ -82,7 +82,7 @@ _STATED = (
 # Of these sizes, where walls and registration were taken from an image (measure/wall_trace.py): 3 um are left of walls
 # that were 12 um off. In ten simulated flights 0.3 of all had a smaller CRPS than 1, 0.15, and 0.3 without resistance.
 AS_PICTURED = 0.3
-_PICTURED = ("resistance", "walls", WALL_BIAS_NAME, "offset", "scale", "angle")
+_PICTURED = ("resistance", "walls", "offset", "scale", "angle")
 DISTURBED = (3.0, 1.0)  # of a disturbance that was noticed, in typical stated standard deviations of an observation
 NEIGHBOURHOOD_PX = 6.0  # over which the correlation of the model's local error falls to 1 / e
 SLOWEST_HZ = 0.05  # of a line
