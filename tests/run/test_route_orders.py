@@ -84,7 +84,7 @@ def test_a_pause_takes_nothing_from_the_time_of_a_survey():
         estimate=SimpleNamespace(covariance=np.eye(4)),
         extra={},
         health=SimpleNamespace(limit_hz=None),
-        route=SimpleNamespace(arrival_s=np.array([0.0, 7.0])),
+        route=SimpleNamespace(arrival_s=np.array([0.0, 7.0]), lasts_s=7.0),
         demand=SimpleNamespace(progress_s=4.0),
         **{"field": 1, "observations": None, "tracer_flow": None},
     )

@@ -15,6 +15,7 @@ from typer.main import get_command
 
 from flowrec.bench import plan
 from flowrec.core import REPLAYED, terminal
+from flowrec.verbs import completion
 from flowrec.verbs.cli import app, with_default_refine
 from tests.conftest import invoke, run
 
@@ -110,6 +111,7 @@ def test_a_shell_completes_verbs_methods_and_settings(
     words: str, offered: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("_FLOWREC_COMPLETE", "complete_bash")
+    monkeypatch.setattr(completion, "_key", "")  # of a process that completes once
     monkeypatch.setenv("COMP_WORDS", words)
     monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
     run([])
