@@ -88,6 +88,13 @@ class Chip:
         return self.mask.shape[1] * self.um_per_px, self.mask.shape[0] * self.um_per_px
 
     @property
+    def greys(self) -> NDArray[np.uint8]:
+        """(h, w) grey levels of the mask in its file."""
+        if self.walls == "grey" and self.level_px is not None:
+            return greys_of(self.level_px)
+        return np.where(self.mask, 255, 0).astype(np.uint8)
+
+    @property
     def is_open_field(self) -> bool:
         """True where there is no channel: all is fluid but the border of the mask."""
         return bool(self.mask[1:-1, 1:-1].all())
@@ -128,6 +135,6 @@ def greys_of(level_px: Floats32) -> NDArray[np.uint8]:
     return np.clip(np.rint(128.0 + GREYS_PER_PX * level_px), 0.0, 255.0).astype(np.uint8)
 
 
-def levels_of(greys: NDArray[np.uint8]) -> Floats32:
+def levels(greys: NDArray[np.uint8]) -> Floats32:
     """(h, w) signed distances to the walls, in px, of grey levels."""
     return np.asarray((greys.astype(np.float64) - 128.0) / GREYS_PER_PX, np.float32)

@@ -49,18 +49,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from flowrec.core import Bools, ChipError, hints, parse_toml, refuse_irregular
-from flowrec.physics.chip.chip import (
-    WATER_KG_M3,
-    WATER_MPA_S,
-    Chip,
-    ChipSettings,
-    Kind,
-    Opening,
-    Side,
-    Walls,
-    greys_of,
-    levels_of,
-)
+from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings, Kind, Opening, Side, Walls, levels
 from flowrec.physics.chip.fluid import (
     BLOOD_KG_M3,
     BLOOD_MPA_S,
@@ -210,10 +199,7 @@ def load_chip(settings: ChipSettings, mask: Bools | None = None) -> Chip:
 
 def chip_files(chip: Chip) -> tuple[bytes, str]:
     """PNG and TOML of a chip, from which `chip_from_files` makes exactly the same one."""
-    greys = np.where(chip.mask, 255, 0).astype(np.uint8)
-    if chip.walls == "grey" and chip.level_px is not None:
-        greys = greys_of(chip.level_px)
-    written, png = cv2.imencode(".png", greys)
+    written, png = cv2.imencode(".png", chip.greys)
     if not written:
         raise ChipError(f"{chip.name}: the mask can not be written as PNG; is it {chip.mask.shape} pixels?")
     numbers = {key: getattr(chip, key) for key in CHIP_NUMBERS}
@@ -269,7 +255,7 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
         number["depth_um"],
         walls,
         law=law,
-        level_px=levels_of(greys) if walls == "grey" else None,
+        level_px=levels(greys) if walls == "grey" else None,
     )
     check_chip(chip, where)
     return chip

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from flowrec.core import Bools, Floats32, FlowError
-from flowrec.physics.chip.chip import Chip, Opening, greys_of, levels_of
+from flowrec.physics.chip.chip import Chip, Opening, greys_of, levels
 from flowrec.physics.chip.io import without_pockets
 from flowrec.physics.chip.openings import border, run_around
 from flowrec.physics.flow.level_set import CLEARANCE_PX, from_mask
@@ -38,7 +38,7 @@ def with_levels(chip: Chip, level_px: Floats32) -> Chip:
     Levels are rounded to steps of 1 / GREYS_PER_PX, as its file has them. Raises FlowError if an opening closes, or two
     meet.
     """
-    level_px = levels_of(greys_of(level_px))
+    level_px = levels(greys_of(level_px))
     mask = np.ascontiguousarray(level_px >= 0.0)
     mask.flags.writeable = False
     openings = _in_other_walls(chip, mask, "walls as they were measured")
