@@ -10,9 +10,9 @@ from flowrec.core.messages import Observations
 from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.physics.flow.wall_offset import with_wall_offset
-from flowrec.stages.refine import Refiner
-from flowrec.stages.refine.wall_bias import nearest_offset, wall_mode
+from flowrec.physics.flow.wall_offset import with_levels, with_wall_offset
+from flowrec.stages.refine import Assimilate, Refiner
+from flowrec.stages.refine.wall_bias import OFFSETS_PX, nearest_offset, wall_mode
 
 WIDTH_PX, SPEED_UM_S = 12, 100.0
 
@@ -59,6 +59,14 @@ def test_the_first_order_of_the_flow_is_the_derivative_of_the_parabola_at_the_sa
 
 def test_offsets_are_tried_at_steps_and_never_beyond_the_largest():
     assert [nearest_offset(found) for found in (0.1, -0.3, 0.8, 7.0)] == [0.0, -0.5, 1.0, 2.0]
+
+
+def test_walls_that_an_image_has_shown_are_not_tried_elsewhere():
+    chip = channel()
+    level_px = np.clip(0.5 * WIDTH_PX - np.abs(np.arange(30) - 14.5), -2.5, 2.5)
+    shown = with_levels(chip, np.repeat(level_px[:, None], 60, axis=1))
+    drawn, grey = (len(list(Assimilate().preparations(each, FlowSolver(2)))) for each in (chip, shown))
+    assert grey == drawn - 1 - len(OFFSETS_PX)
 
 
 @pytest.mark.slow("solves the flow of three vessels between other walls")
