@@ -59,7 +59,7 @@ _DENSE = 8  # points of a wall per pixel, from which distances are taken
 # Median correlation of a picture clear enough to correct a mask: of a right one, a trace in noise (correlation 0.86 to
 # 0.94) or out of focus (0.75 to 0.85) is 0.3 to 0.6 px off, of other looks (over 0.98) at most 0.14.
 _CLEAR = 0.96
-_SAME_PX = 0.1  # of the camera: a pose that differs by less is the stated one
+_SAME_PX = 0.3  # of the camera: a pose that differs by less is the stated one; of dye, a right one is so far taken off
 
 
 class TracedWalls(NamedTuple):

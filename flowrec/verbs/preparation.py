@@ -98,7 +98,8 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
         image, walls = (known.image, known.walls) if known is not None else _looked_at(config, chip)
         if image is not None:
             facts["source_axes"] = image.text
-        if config.camera.trace_walls:
+        # Of a movie that shakes, the registration is that of the mean place, which a median image need not show.
+        if config.camera.trace_walls and not any(config.stabilise.first_px):
             picture = _picture_of(config)
             if walls is not None and not walls.other_scale:  # of another scale, mask or registration may be wrong
                 walls = None

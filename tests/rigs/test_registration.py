@@ -41,10 +41,11 @@ def test_a_turned_camera_costs_nothing_where_the_settings_say_so(name, tmp_path)
 
 
 @pytest.mark.slow("flies a mission with a turned camera")
-def test_a_turned_camera_of_which_the_settings_know_nothing_spoils_track_and_flow(tmp_path):
-    error, track_um = flown(tmp_path, "simulated.angle_deg=2")
-    assert error > 0.04
-    assert track_um > 20.0
+def test_a_turned_camera_of_which_the_settings_know_nothing_spoils_track_and_flow_unless_its_image_is_asked(tmp_path):
+    for name, asked in (("asked", "true"), ("not_asked", "false")):
+        (tmp_path / name).mkdir()
+        error, track_um = flown(tmp_path / name, "simulated.angle_deg=2", f"camera.trace_walls={asked}")
+        assert (error < 0.02) == (track_um < 5.0) == (asked == "true")
 
 
 @pytest.mark.parametrize("name", TURNED)

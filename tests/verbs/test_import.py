@@ -318,8 +318,8 @@ def test_walls_that_are_not_where_the_registration_says_are_told_before_the_impo
     for angle_deg, told in ((0.0, False), (2.0, True)):
         config = replace(lab.config, camera=replace(lab.config.camera, angle_deg=angle_deg))
         flowrec.import_movie(tmp_path / "few", tmp_path / f"{angle_deg}.mcap", config, fps=10.0)
-        assert ("from where the registration puts them" in capsys.readouterr().err) == told
-        assert ("source_walls" in flowrec.info(tmp_path / f"{angle_deg}.mcap")) == told
+        assert ("px from where the registration puts it" in capsys.readouterr().err) == told
+        assert ("px from where" in flowrec.info(tmp_path / f"{angle_deg}.mcap")["source_walls"]) == told
 
 
 @pytest.mark.parametrize(
