@@ -32,7 +32,7 @@ from flowrec.physics import Calibration, Chip, check_point, median_width_um, smo
 from flowrec.stages import ResolvedConfig, registration_of
 
 _STEP_PX = 0.125  # between the places that are compared, in px of the mask, as all lengths here
-_OUT_PX, _IN_WIDTHS = 3.0, 0.45  # largest motion of a wall outwards; and inwards, in median channel widths
+_OUT_PX, _IN_WIDTHS = 3.0, 0.7  # largest motion of a wall outwards; and inwards, in median channel widths
 _WINDOW_WIDTHS, _WINDOW_PX = 0.3, (1.0, 2.0)  # half length of a profile: in median channel widths, but within this
 _STEPS_ALONG = 4  # by which neighbours may differ at most
 _STIFFNESS, _REST = 0.15, 0.01  # costs of a difference (px^2) between neighbours, and of a motion (px)
@@ -56,6 +56,9 @@ _LEAST_SEEN, _LEAST_WALL_PX, _MOST_WALL_PX = 0.9, 30, 1.5
 _UNKNOWN = 0.02  # motions that move walls by less, relative to the others, stay as stated: along a straight channel
 _REACH_PX = 6.0  # from a wall, up to which the side of it is that of the nearest point
 _DENSE = 8  # points of a wall per pixel, from which distances are taken
+# Points of a wall, and times the noise: a corner of a right mask is at most 1.1 px off over so many, an obstacle that
+# leaves half or two thirds of a channel 1.9 to 7 px.
+_STRETCH, _OBSTACLE = 7, 10.0
 # Median correlation of a picture clear enough to correct a mask: of a right one, a trace in noise (correlation 0.86 to
 # 0.94) or out of focus (0.75 to 0.85) is 0.3 to 0.6 px off, of other looks (over 0.98) at most 0.14.
 _CLEAR = 0.96
@@ -70,17 +73,14 @@ class TracedWalls(NamedTuple):
     level_px: Floats32  # (h, w) signed distances of the mask's pixel centres to the walls
     wall_px: float  # root mean square distance of the walls from those of the mask, in its pixels
     noise_px: float  # that of a right mask
+    obstacle_px: float  # distance from the mask's that a stretch of _STRETCH points of a wall exceeds in its half
     alike: float  # median correlation of a wall with the others
 
     @property
     def walls_differ(self) -> bool:
         """True if the mask differs from what the picture shows by more than the noise of a trace."""
-        return self.wall_px > self.noise_px and self.alike >= _CLEAR
-
-    @property
-    def chip_lies_elsewhere(self) -> bool:
-        """True if the stated registration differs by more than the noise of a trace."""
-        return self.moved_px > _SAME_PX
+        differs = self.wall_px > self.noise_px or self.obstacle_px > _OBSTACLE * self.noise_px
+        return differs and self.alike >= _CLEAR
 
 
 def as_pictured(config: ResolvedConfig, chip: Chip, picture: Image) -> tuple[ResolvedConfig, Chip, str]:
@@ -97,7 +97,7 @@ def as_pictured(config: ResolvedConfig, chip: Chip, picture: Image) -> tuple[Res
     if traced is None:
         return config, chip, "the image does not show the walls: registration and mask are as stated"
     found = []
-    if traced.chip_lies_elsewhere:
+    if traced.moved_px > _SAME_PX:
         height, width = picture.shape
         now = traced.calibration
         x_um, y_um = now.to_um((0.5 * (width - 1), 0.5 * (height - 1))).tolist()
@@ -147,6 +147,7 @@ def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls 
         contours.levels(out_px),
         float(np.sqrt((out_px[seen] ** 2).mean())),
         _NOISE_PX * max(1.0, calibration.um_per_px / chip.um_per_px),
+        float(scipy.ndimage.median_filter(np.abs(out_px), _STRETCH).max()),
         float(np.nanmedian(like)),
     )
 
