@@ -98,16 +98,12 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
         image, walls = (known.image, known.walls) if known is not None else _looked_at(config, chip)
         if image is not None:
             facts["source_axes"] = image.text
-        # Of a movie that shakes, the registration is that of the mean place, which a median image need not show.
-        if config.camera.trace_walls and not any(config.stabilise.first_px):
-            picture = _picture_of(config)
-            if walls is not None and not walls.other_scale:  # of another scale, mask or registration may be wrong
-                walls = None
-            if picture is not None:
-                config, chip, shown = as_pictured(config, chip, picture)
-                if shown:
-                    facts["source_walls"] = shown
-                    tell(f"{config.movie.path}: {shown}")
+        config, chip, shown = _as_pictured(config, chip)
+        if shown:
+            facts["source_walls"] = shown
+            tell(f"{config.movie.path}: {shown}")
+        if shown and walls is not None and not walls.other_scale:
+            walls = None  # of another scale, mask or registration may be wrong; all else is mended
         if walls is not None and not walls.good:
             caution(walls.text)
             facts["source_walls"] = walls.text
@@ -146,6 +142,16 @@ def _looked_at(config: ResolvedConfig, chip: Chip) -> tuple[ImageVerdict | None,
         return None, None
     verdict = checked_image(image, config, chip, config.movie.path)
     return verdict, walls_state(image, chip, registration_of(config.camera, chip))
+
+
+def _as_pictured(config: ResolvedConfig, chip: Chip) -> tuple[ResolvedConfig, Chip, str]:
+    """`as_pictured` by the images of a movie, where that is asked for; '': it is not, or they can not be read.
+
+    Of a movie that shakes, the registration is that of the mean place, which a median image need not show.
+    """
+    asked = config.camera.trace_walls and not any(config.stabilise.first_px)
+    picture = _picture_of(config) if asked else None
+    return (config, chip, "") if picture is None else as_pictured(config, chip, picture)
 
 
 def _picture_of(config: ResolvedConfig) -> Image | None:
