@@ -18,7 +18,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from flowrec.core import ChipError, Image
+from flowrec.core import ChipError, Floats, Image
 from flowrec.measure.images import Colours, Mask, with_curves
 from flowrec.measure.wall_fit import Fitter, WallFit
 from flowrec.measure.wall_search import WallMap, WallSearch
@@ -103,7 +103,7 @@ def register(
     fits.sort(key=lambda fit: bool(_loose(fit).any()))
     distinct: list[WallFit] = []
     for fit in fits:
-        if all(_apart_px(fit.calibration, other.calibration, scene.walls) > _SAME_PX for other in distinct):
+        if all(apart_px(fit.calibration, other.calibration, scene.walls.points_um) > _SAME_PX for other in distinct):
             distinct.append(fit)
     distinct.sort(key=lambda fit: -fit.found * fit.explained)
     if not distinct or distinct[0].found < _LEAST_FOUND:
@@ -143,7 +143,8 @@ def moved_px(fit: WallFit, chip: Chip, assumed: Calibration) -> float | None:
 
     None if the picture does not tell, because it does not show enough of them.
     """
-    return None if _loose(fit).any() else _apart_px(fit.calibration, assumed, WallMap(chip.mask, chip.um_per_px))
+    walls = WallMap(chip.mask, chip.um_per_px)
+    return None if _loose(fit).any() else apart_px(fit.calibration, assumed, walls.points_um)
 
 
 def other_scale(fit: WallFit, assumed: Calibration) -> float | None:
@@ -153,9 +154,9 @@ def other_scale(fit: WallFit, assumed: Calibration) -> float | None:
     return fit.calibration.um_per_px if contradicts else None
 
 
-def _apart_px(one: Calibration, other: Calibration, walls: WallMap) -> float:
-    """Root mean square distance of the walls of two poses in the image."""
-    off = one.to_px(walls.points_um) - other.to_px(walls.points_um)
+def apart_px(one: Calibration, other: Calibration, points_um: Floats) -> float:
+    """Root mean square distance of points (n, 2) on the walls of two poses in the image."""
+    off = one.to_px(points_um) - other.to_px(points_um)
     return float(np.sqrt(np.mean(np.sum(off * off, -1))))
 
 

@@ -56,7 +56,7 @@ class WallMap:
         height, width = mask.shape
         self.size_um = (width * um_per_px, height * um_per_px)
         rows, columns = np.nonzero(np.abs(self.clearance_um) < um_per_px)
-        self.points_um = np.stack((columns, rows), -1) * um_per_px
+        self.points_um: Floats = np.asarray(np.stack((columns, rows), -1) * um_per_px, np.float64)
         self._all = np.stack((self.clearance_um, right, down), -1)
 
     def at(self, points_um: Floats) -> tuple[Floats, Floats, Mask]:

@@ -21,11 +21,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import scipy  # its ndimage and spatial load at first use, not at start-up
-from numpy.typing import NDArray
 
-from flowrec.core import Bools, ChipError, Floats, Floats32, FlowError, Image, Ints
+from flowrec.core import STD_PER_MAD, Bools, ChipError, Floats, Floats32, FlowError, Image, Ints
 from flowrec.measure.images import Levels, shrink
-from flowrec.measure.picture_registration import fit_nearby, is_legible
+from flowrec.measure.picture_registration import apart_px, fit_nearby, is_legible
 from flowrec.measure.wall_fit import level_contrast
 from flowrec.measure.wall_search import move_chip
 from flowrec.physics import Calibration, Chip, check_point, median_width_um, smooth_contours, with_levels
@@ -138,12 +137,10 @@ def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls 
     if found is None:
         return None
     calibration, out_px, like, _ = found
-    points_um = contours.points * chip.um_per_px
-    off = calibration.to_px(points_um) - stated.to_px(points_um)
     seen = like >= _LIKE
     return TracedWalls(
         calibration,
-        float(np.sqrt((off**2).sum(axis=1).mean())),
+        apart_px(calibration, stated, contours.points * chip.um_per_px),
         contours.levels(out_px),
         float(np.sqrt((out_px[seen] ** 2).mean())),
         _NOISE_PX * max(1.0, calibration.um_per_px / chip.um_per_px),
@@ -242,14 +239,13 @@ def _follow(picture: Image, contours: _Contours, start: Calibration, sided: bool
         usable = contours.inside & np.isfinite(profiles).all(axis=1)
         if np.count_nonzero(usable) < _LEAST_WALL_PX or not profiles[usable].std() > 0.0:
             return None
-        present = np.clip(np.rint(out_px / _STEP_PX).astype(np.intp) - places[0], 0, len(places) - 1)
+        at = _nearest_places(out_px, places)
         towards = (calibration.axes @ contours.inward.T).T  # where the fluid lies, in the image
-        at_walls = _windows(profiles, window)[np.arange(len(present)), present]
+        at_walls = _windows(profiles, window)[at]
         expected, share = _expect_profiles(at_walls, towards, usable, sided)
         likeness = _likeness(profiles, expected, usable)
         out_px = _move_walls(likeness, usable, places, contours)
-        best = np.clip(np.rint(out_px / _STEP_PX).astype(np.intp) - places[0], 0, len(places) - 1)
-        like = np.where(usable, likeness[np.arange(len(best)), best], np.nan)
+        like = np.where(usable, likeness[_nearest_places(out_px, places)], np.nan)
         if np.count_nonzero(like >= _LIKE) < _LEAST_WALL_PX:
             return None
         calibration, out_px, moved_px = _move_pose(calibration, contours, out_px, like >= _LIKE)
@@ -265,7 +261,12 @@ def _follow(picture: Image, contours: _Contours, start: Calibration, sided: bool
     return _Followed(calibration, out_px, like, share)
 
 
-def _steep_place(expected: NDArray[np.float32]) -> float:
+def _nearest_places(out_px: Floats, places: Ints) -> tuple[Ints, Ints]:
+    """Indices (n,) of points and of the places nearest to where their walls are, together."""
+    return np.arange(len(out_px)), np.clip(np.rint(out_px / _STEP_PX).astype(np.intp) - places[0], 0, len(places) - 1)
+
+
+def _steep_place(expected: Floats32) -> float:
     """Distance in px from the present walls, outwards, to where profiles (n, m) are steep: a mean by squared slope."""
     steep = (np.diff(expected, axis=1) ** 2).sum(axis=0)
     places = _STEP_PX * (np.arange(len(steep)) - 0.5 * (len(steep) - 1))
@@ -285,7 +286,7 @@ def _level_picture(picture: Image, chip: Chip, start: Calibration, width_px: flo
 
 def _profiles(
     image: Levels, step: int, contours: _Contours, calibration: Calibration, places: Ints, window: int
-) -> NDArray[np.float32]:
+) -> Floats32:
     """(n, m) grey levels across the walls, outwards: a window before the first place to one after the last.
 
     `step` pixels of the camera are one of the image. NaN beside the image.
@@ -298,14 +299,12 @@ def _profiles(
     return np.asarray(contours.along(np.asarray(seen, np.float64), _ALONG_PX), np.float32)
 
 
-def _windows(profiles: NDArray[np.float32], window: int) -> NDArray[np.float32]:
+def _windows(profiles: Floats32, window: int) -> Floats32:
     """(n, places, 2 window + 1) the part of profiles (n, m) around each place."""
     return np.lib.stride_tricks.sliding_window_view(profiles, 2 * window + 1, axis=1)
 
 
-def _expect_profiles(
-    present: NDArray[np.float32], towards: Floats, usable: Bools, sided: bool
-) -> tuple[NDArray[np.float32], float]:
+def _expect_profiles(present: Floats32, towards: Floats, usable: Bools, sided: bool) -> tuple[Floats32, float]:
     """(n, m) the common profile at each wall, of mean 0, and the size of its b and c over that of its a.
 
     Parameters
@@ -326,7 +325,7 @@ def _expect_profiles(
     return np.asarray(expected - expected.mean(axis=1, keepdims=True), np.float32), share
 
 
-def _likeness(profiles: NDArray[np.float32], expected: NDArray[np.float32], usable: Bools) -> Floats:
+def _likeness(profiles: Floats32, expected: Floats32, usable: Bools) -> Floats:
     """(n, places) correlation of profiles (n, m) around each place with the expected one (n, 2 window + 1)."""
     length = expected.shape[1]
     around = _windows(profiles, length // 2)
@@ -387,12 +386,12 @@ def _move_pose(
         root = np.sqrt(weight)[:, None]
         move, *_ = np.linalg.lstsq(root * design, root[:, 0] * out_px, rcond=_UNKNOWN)
         left = out_px - design @ move
-        scale = 1.48 * float(np.median(np.abs(left[seen]))) + 1e-6
+        scale = STD_PER_MAD * float(np.median(np.abs(left[seen]))) + 1e-6
         weight = seen / (1.0 + (left / (2.0 * scale)) ** 2)
     px = contours.chip.um_per_px
     middle_um = px * points.mean(axis=0)
     middle_px, per = calibration.to_px(middle_um), px / calibration.um_per_px
-    shift_px = calibration.to_px(middle_um + px * move[:2]) - middle_px
+    shift_px = calibration.vectors_to_px(px * move[:2])
     turn = -move[2] if calibration.mirror else move[2]
     moved = move_chip(calibration, np.array([*shift_px, per * turn, per * move[3]]), middle_px, per * reach)
     return moved, left, float(np.abs(move[:4]).max())
