@@ -55,6 +55,7 @@ class Prepared(NamedTuple):
     derived : settings that were derived because they were not given, by key.
     facts : about the source of a movie, for the head of the session.
     image, walls : what the images of a movie say about the axes and the registration; None: not looked at, or nothing.
+    picture : the median (h, w) of images of a movie.
     """
 
     config: ResolvedConfig
@@ -64,6 +65,7 @@ class Prepared(NamedTuple):
     facts: Mapping[str, str]
     image: ImageVerdict | None = None
     walls: WallsState | None = None
+    picture: Image | None = None
 
 
 def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) -> Prepared:
@@ -93,12 +95,13 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
             caution(remark)
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
-    image = walls = None
+    image = walls = picture = None
     if asked.rig == MOVIE:
-        image, walls = (known.image, known.walls) if known is not None else _looked_at(config, chip)
+        picture = _picture_of(config) if known is None else known.picture
+        image, walls = _looked_at(config, chip, picture) if known is None else (known.image, known.walls)
         if image is not None:
             facts["source_axes"] = image.text
-        config, chip, shown = _as_pictured(config, chip)
+        config, chip, shown = _as_pictured(config, chip, picture)
         if shown:
             facts["source_walls"] = shown
             tell(f"{config.movie.path}: {shown}")
@@ -132,26 +135,26 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
             f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
-    return Prepared(config, chip, assemble(config, chip), made, facts, image, walls)
+    return Prepared(config, chip, assemble(config, chip), made, facts, image, walls, picture)
 
 
-def _looked_at(config: ResolvedConfig, chip: Chip) -> tuple[ImageVerdict | None, WallsState | None]:
-    """Verdict of a movie on the axes, and that of its walls on the registration."""
-    image = _picture_of(config)
+def _looked_at(
+    config: ResolvedConfig, chip: Chip, image: Image | None
+) -> tuple[ImageVerdict | None, WallsState | None]:
+    """Verdict of a movie's image (h, w) on the axes, and that of its walls on the registration."""
     if image is None:
         return None, None
     verdict = checked_image(image, config, chip, config.movie.path)
     return verdict, walls_state(image, chip, registration_of(config.camera, chip))
 
 
-def _as_pictured(config: ResolvedConfig, chip: Chip) -> tuple[ResolvedConfig, Chip, str]:
-    """`as_pictured` by the images of a movie, where that is asked for; '': it is not, or they can not be read.
+def _as_pictured(config: ResolvedConfig, chip: Chip, picture: Image | None) -> tuple[ResolvedConfig, Chip, str]:
+    """`as_pictured` by the image (h, w) of a movie, where that is asked for; '': it is not, or there is none.
 
     Of a movie that shakes, the registration is that of the mean place, which a median image need not show.
     """
     asked = config.camera.trace_walls and not any(config.stabilise.first_px)
-    picture = _picture_of(config) if asked else None
-    return (config, chip, "") if picture is None else as_pictured(config, chip, picture)
+    return as_pictured(config, chip, picture) if asked and picture is not None else (config, chip, "")
 
 
 def _picture_of(config: ResolvedConfig) -> Image | None:
