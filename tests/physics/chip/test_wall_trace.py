@@ -27,19 +27,21 @@ def levels(mask):
 class Scene:
     """A chip whose walls are up to `error_px` off, with a blocked branch, in an image that is not as stated."""
 
-    def __init__(self, chip, look, error_px, um_per_px=1.006, shift_um=(12.0, -9.0), angle_deg=0.25, mirror=False):
-        rng = np.random.default_rng(7)
+    def __init__(
+        self, chip, look, error_px, um_per_px=1.006, shift_um=(12.0, -9.0), angle_deg=0.25, mirror=False, finer=1
+    ):
+        rng, size_px = np.random.default_rng(7), (finer * SIZE_PX[0], finer * SIZE_PX[1])
         blocked = 0.35 if error_px else 0.0
         self.chip, self.true = chip, true_walls(chip, error_px, blocked, np.zeros((0, 2)), rng)[0]
         self.first_um = 0.5 * (self.true.um_per_px - chip.um_per_px)
         size_um = np.array(chip.size_um)
-        scale_um, middle_um = 1.02 * float(max(size_um / SIZE_PX)), 0.5 * (size_um - chip.um_per_px)
-        self.stated = Calibration.centre_on(scale_um, middle_um, SIZE_PX, 0.0, mirror)
-        self.camera = Calibration.centre_on(um_per_px * scale_um, middle_um + shift_um, SIZE_PX, angle_deg, mirror)
+        scale_um, middle_um = 1.02 * float(max(size_um / size_px)), 0.5 * (size_um - chip.um_per_px)
+        self.stated = Calibration.centre_on(scale_um, middle_um, size_px, 0.0, mirror)
+        self.camera = Calibration.centre_on(um_per_px * scale_um, middle_um + shift_um, size_px, angle_deg, mirror)
         x_um, y_um = self.camera.origin_um
         of_true = replace(self.camera, origin_um=(x_um - self.first_um, y_um - self.first_um))
         self.image = picture(
-            self.true.mask, self.true.um_per_px, of_true, SIZE_PX, LOOKS[look], np.random.default_rng(4)
+            self.true.mask, self.true.um_per_px, of_true, size_px, LOOKS[look], np.random.default_rng(4)
         )
 
     def off_um(self, calibration):
@@ -97,6 +99,12 @@ def test_a_mask_that_is_too_narrow_or_too_wide_everywhere_is_corrected(offset_px
 
 def test_the_pose_in_a_mirror_image_is_found():
     scene = Scene(BIFURCATION, "dark lines", 0.0, mirror=True)
+    assert scene.off_um(trace_walls(scene.image, BIFURCATION, scene.stated).calibration) < 1.5
+
+
+def test_a_camera_of_six_times_the_resolution_of_the_mask_finds_the_pose_too():
+    scene = Scene(BIFURCATION, "dark lines", 0.0, finer=3)
+    assert scene.off_um(scene.stated) > 14.0
     assert scene.off_um(trace_walls(scene.image, BIFURCATION, scene.stated).calibration) < 1.5
 
 
