@@ -21,13 +21,13 @@ from flowrec.core import FlowrecError, RigError
 from flowrec.rigs import CommandLimits, Guardian
 from flowrec.rigs.lab.drive import Drive
 from flowrec.stages import FieldCommand, OutputLimits
-from tests.conftest import needs_quiet, until
+from tests.conftest import feeds_an_output, needs_quiet, until
 from tests.extras import why
 from tests.perf.guardian import sleeper, trial
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, SIX_COILS, amplifier, coils_of, currents
 from tests.twins.coils import Device, channels, device
 
-pytestmark = needs_quiet
+pytestmark = [needs_quiet, feeds_an_output]
 
 SLACK_S = 0.25  # of a busy machine, besides the delay of a sleep that is measured meanwhile
 
