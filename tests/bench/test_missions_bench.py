@@ -11,7 +11,8 @@ import pytest
 from flowrec.bench import missions
 from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import paired_ratio, wilson
-from flowrec.bench.missions import MissionLog, TrueWorld, chip_of, compare_times, fly, optimum_s, results_of, summary
+from flowrec.bench.mission_tables import compare_times, summary
+from flowrec.bench.missions import MissionLog, TrueWorld, chip_of, fly, optimum_s, results_of
 from flowrec.core.errors import UsageError
 from flowrec.physics.chip.chip import ChipSettings
 from flowrec.physics.chip.io import load_chip

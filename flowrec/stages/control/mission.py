@@ -1,6 +1,8 @@
 """The mission state machine: the phase of a run, the work order that it waits for, and the end of the run.
 
 Notes and outcomes are part of recorded sessions and are compared exactly in a replay: their texts do not change.
+
+Long because each phase stands beside the settings that it reads; what no setting changes is in mission_steps.py.
 """
 
 from __future__ import annotations

@@ -30,18 +30,16 @@ from flowrec.stages.refine.flow_model import FlowModel, flow_model
 from flowrec.stages.refine.held_back import scores_of
 from flowrec.stages.refine.hypothesis import (
     HypothesisFit,
-    Robust,
     State,
     Steps,
     begin,
     complete,
     first_evidence,
     of_the_field,
-    outlying,
-    robust_noise,
     shaking_stage,
 )
 from flowrec.stages.refine.method import RefinementProblem
+from flowrec.stages.refine.noise import Robust, outlying, robust_noise
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.obstacles import PLACES, Obstacle, likely_obstacles, with_shape_error
 from flowrec.stages.refine.predictive_check import find_departure

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flowrec.physics import Doubts, FlowSolver, chip_key, compute_cached
 from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.flow_model import FlowModel
-from flowrec.stages.refine.hypothesis import Robust
+from flowrec.stages.refine.noise import Robust
 from flowrec.stages.refine.obstacles import BATCH, BLOCKED, DEPOSIT, Likelihood, pieces_of, saturating_modes
 
 HEIGHT = 1.0  # of a deposit, in half widths

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from flowrec.core import Floats, FlowField, seconds
 from flowrec.physics import on_chip
-from flowrec.stages.refine.hypothesis import HypothesisFit, averages, groups
+from flowrec.stages.refine.hypothesis import HypothesisFit
+from flowrec.stages.refine.noise import averages, groups
 from flowrec.stages.refine.observation_operator import ObservationOperator
 
 Indices = NDArray[np.intp]

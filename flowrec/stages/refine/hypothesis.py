@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # its sparse loads at first use, not at start-up
-from numpy.typing import NDArray
 
 from flowrec.core import Bools, Floats
 from flowrec.physics import Registration, Remainder, fluid_image
@@ -21,15 +20,17 @@ from flowrec.stages.refine.causes import (
 )
 from flowrec.stages.refine.disturbances import likeliest_hz, shaking
 from flowrec.stages.refine.evidence import Effect, EffectModel, Posterior, Sizes, gains_of_trials
-from flowrec.stages.refine.mixture_regression import Model
-from flowrec.stages.refine.observation_operator import Disturbance, ObservationOperator
+from flowrec.stages.refine.noise import (
+    MOST_OBSERVATIONS,
+    NOISE,
+    NOISIER,
+    Robust,
+    averages,
+    outlying,
+    robust_noise,
+)
+from flowrec.stages.refine.observation_operator import Disturbance
 
-MOST_OBSERVATIONS = 120  # of which the evidence is computed: more are first averaged along the way
-LEAST_STD = 1e-3  # of the typical observed speed: no observation is more accurate
-LEAST_INLIER = 1e-6  # probability: the noise of an observation is divided by it
-OUTLIER_SCALE = 3.0  # size of an outlier's components over the typical component of the observations
-OUTLIER_NATS = 2.0 * float(np.log(OUTLIER_SCALE / 0.15))  # of two components; the noise is 15 % of the typical speed
-NOISE = ("noise", 0.7, 0.6)  # size of the stated noise: name, median, ln_std; a filter states what is safe
 MOST_MOVES = 3  # iterations of fit and registration; the first finds nearly all of the offset
 # Other starts of the registration, tried where the map is doubtful: offset x and y in px, scale, angle in rad.
 REGISTRATIONS = ((0.0, 0.0, 0.025, 0.0), (0.0, 0.0, -0.025, 0.0))
@@ -42,7 +43,6 @@ DOUBTED = (
 )
 FAR_PX = 0.5  # by which an observation is moved at least: over less, the flow is linear
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
-NOISIER = 1.3  # noise over the stated one from which on it is reported, and a shaking stage is tried
 WORTH_A_SHAKE = 8.0  # in ln evidence, at the best of some hundred independent frequencies
 LINE_TRIALS = (0.03, 0.1, 0.3)  # amplitudes at which frequencies are compared
 FIELD_EFFECTS = (
@@ -52,15 +52,6 @@ FIELD_EFFECTS = (
     "walls",
     WALL_BIAS_NAME,
 )  # the first ones, in the order of the columns of the flow
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Robust:
-    """Noise of the observations without their outliers."""
-
-    variance: Floats  # (n,) of each component, stated
-    inlier: Floats  # (n,) probability
-    factor: float  # actual over stated standard deviation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,39 +155,6 @@ def of_the_field(found: HypothesisFit) -> tuple[Floats, Floats]:
     return own - found.observed.beyond_first_order(found.in_use), np.sqrt(variance)
 
 
-def robust_noise(observed: Observed) -> Robust:
-    """Outliers and a common factor of the noise, by a mixture model in which every effect has its usual size."""
-    here = observed.operator
-    effects = observed.effects(observed.model.base, None)
-    design = np.concatenate([2.0 * effect.median * effect.columns for effect in effects if len(effect.columns)])
-    variance = noise_variance(here)
-    power = (here.flow_um_s**2).sum(axis=1)
-    wide = OUTLIER_SCALE**2 * 0.5 * float(np.median(power)) + float(here.std_um_s.max()) ** 2 + 1e-9
-    misfit = here.flow_um_s - here.predict(observed.model.base)
-    # Effects with a kernel (changes in time, errors of the grid and of the profile) have no columns: their variance is
-    # added to that of the noise.
-    local = sum(
-        (
-            effect.median**2 * 0.5 * np.diag(effect.kernel).reshape(-1, 2).sum(axis=1)
-            for effect in effects
-            if effect.kernel is not None
-        ),
-        np.zeros(here.count),
-    )
-    found = Model(design.reshape(len(design), -1, 2), misfit, variance + local, wide).fit()
-    return Robust(variance, np.maximum(found.inlier, LEAST_INLIER), found.noise_factor)
-
-
-def outlying(robust: Robust) -> float:
-    """Reduction of a hypothesis's evidence for its outliers, in nats.
-
-    The noise variance of an observation is divided by its probability to be an inlier, so the evidence already contains
-    a loss of -ln(inlier) for each one that is not averaged with others; that part is not subtracted twice.
-    """
-    nats = OUTLIER_NATS * float((1.0 - robust.inlier).sum())
-    return nats if len(robust.inlier) > MOST_OBSERVATIONS else nats + float(np.log(robust.inlier).sum())
-
-
 def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
     """A stage that shakes, where observations scatter more than they state and one frequency explains that.
 
@@ -218,13 +176,6 @@ def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
         return None
     pump = _evidence(observed, robust, np.zeros_like(base), base, hz).sizes().evidence
     return found if after > pump else None
-
-
-def noise_variance(operator: ObservationOperator) -> Floats:
-    """(n,) stated variance of each component."""
-    # A std of 0 in solid would be a contradiction that no noise explains.
-    least = LEAST_STD**2 * float(np.median((operator.flow_um_s**2).sum(axis=1))) + 1e-12
-    return np.asarray(operator.std_um_s**2 + least)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -389,28 +340,6 @@ def _evidence(
     effects.append(Effect(*NOISE, np.zeros((0, len(y))), stated))
     least = 1e-9 * float(np.trace(stated)) / len(stated)
     return EffectModel(y, least * np.eye(len(stated)), effects)
-
-
-def groups(operator: ObservationOperator) -> NDArray[np.intp]:
-    """(n,) number of the mean that each observation is a part of, in order; each tracer's is one by itself.
-
-    Neighbours along the way of a robot show nearly the same flow, one tracer and the next do not.
-    """
-    count = operator.count
-    tracers = 0 if operator.tracer is None else int(np.count_nonzero(operator.tracer >= 0.0))
-    rolled = count - tracers
-    means = min(max(MOST_OBSERVATIONS - tracers, 1), rolled)
-    return np.concatenate([np.arange(rolled) * means // max(rolled, 1), means + np.arange(tracers)])
-
-
-def averages(robust: Robust, operator: ObservationOperator) -> Floats:
-    """(m, 2 n) weighted means of neighbours along the way, x and y of each in turn; the identity for few."""
-    count = operator.count
-    group = groups(operator)
-    weight = robust.inlier / robust.variance
-    matrix = np.zeros((group[-1] + 1, count))
-    matrix[group, np.arange(count)] = weight
-    return np.kron(matrix / matrix.sum(axis=1, keepdims=True), np.eye(2))
 
 
 def _line_hz(observed: Observed, robust: Robust, evidence: EffectModel, sizes: Sizes) -> float | None:

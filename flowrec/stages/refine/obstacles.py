@@ -36,7 +36,8 @@ from flowrec.physics import (
 )
 from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.flow_model import FlowModel
-from flowrec.stages.refine.hypothesis import NOISE, HypothesisFit, Robust, of_the_field
+from flowrec.stages.refine.hypothesis import HypothesisFit, of_the_field
+from flowrec.stages.refine.noise import NOISE, Robust
 
 RATIOS = (2.0, 4.0, 10.0, 40.0, 1000.0)  # resistance of a piece over that of a free one: half the width is 8
 DEPOSIT = 1.2  # reach of the deposits that are tried first

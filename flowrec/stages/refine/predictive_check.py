@@ -25,7 +25,8 @@ import numpy as np
 from flowrec.core import Floats
 from flowrec.stages.refine.causes import quarter_turn
 from flowrec.stages.refine.evidence import gains_of_trials
-from flowrec.stages.refine.hypothesis import NOISE, HypothesisFit, averages
+from flowrec.stages.refine.hypothesis import HypothesisFit
+from flowrec.stages.refine.noise import NOISE, averages
 
 # Gain in ln evidence of a departure that is said: above that of 72 surveys in worlds that the model contains.
 NATS = 8.0

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from flowrec.core import Floats
 from flowrec.physics import Chip
-from flowrec.stages.refine.hypothesis import NOISE, NOISIER, HypothesisFit
+from flowrec.stages.refine.hypothesis import HypothesisFit
+from flowrec.stages.refine.noise import NOISE, NOISIER
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.prior import Prior
 

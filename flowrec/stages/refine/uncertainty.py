@@ -13,7 +13,7 @@ from flowrec.stages.refine.causes import GAIN
 from flowrec.stages.refine.doubts import doubted_places
 from flowrec.stages.refine.field_variance import field_columns, left_variance, prior_left_variance, prior_of
 from flowrec.stages.refine.flow_model import flow_model
-from flowrec.stages.refine.hypothesis import NOISE
+from flowrec.stages.refine.noise import NOISE
 from flowrec.stages.refine.observation_operator import ObservationOperator
 
 

@@ -18,17 +18,8 @@ from flowrec.core import Floats, FlowError
 from flowrec.physics import Chip, FlowSolver, chip_key, compute_cached, with_wall_offset
 from flowrec.stages.refine.causes import WALL_BIAS, WALL_BIAS_NAME, Observed
 from flowrec.stages.refine.evidence import gains_of_trials
-from flowrec.stages.refine.hypothesis import (
-    Robust,
-    State,
-    Steps,
-    averages,
-    begin,
-    doubtful,
-    first_evidence,
-    outlying,
-    robust_noise,
-)
+from flowrec.stages.refine.hypothesis import State, Steps, begin, doubtful, first_evidence
+from flowrec.stages.refine.noise import Robust, averages, outlying, robust_noise
 
 STEP_PX = 0.5  # of the offsets at which flows are computed: the walls of pixels can lie at multiples of it
 OFFSETS_PX = (-1.0, -0.5, 0.0, 0.5, 1.0)  # that are compared at first

@@ -2,9 +2,7 @@
 
 Candidates are maxima of the foreground's energy (foreground.py), so an object is one whatever it shows. Each is
 compared with the learned views: the first look, a slow mean of the recent looks, and up to six earlier looks that
-differ. All candidates are assigned at once, to the robot and to the neighbours of the frame before, at the least sum of
-costs (global nearest neighbour, Bar-Shalom and Li 1995): the best match alone would jump to an identical neighbour.
-Where two meet in one image, the neighbour is remembered at its place until they part.
+differ. assignment.py chooses the robot among them.
 
 The position is the centroid of the foreground, which knows no drift. Of a round object a registration with the views is
 more precise; its views are centred by their own centroid, so that does not drift either.
@@ -24,7 +22,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from flowrec.core import Appearance, Floats, Floats32, Image, Ints, Track
+from flowrec.core import Appearance, Floats, Floats32, Image, Ints
 from flowrec.stages.vision.foreground import (
     WINDOW,
     correlation,
@@ -45,18 +43,11 @@ VIEWS = 8  # at most
 _UPDATE_NS = 100_000_000  # least time between two updates of a known look
 _STEP_RADIUS_PX = 6.0  # least radius in the reduced image
 CENTROID_RADII = 1.15  # window of the centroid
-_LEAST_ENERGY = 3.0  # of a candidate, in units of the noise's variance
+LEAST_ENERGY = 3.0  # of a candidate, in units of the noise's variance
 _NEAR, _ALL = 12, 64  # candidates that are measured near the robot, and in a whole image
-# Costs of an assignment, as -ln of its likelihood.
-_SIMILARITY_COST, _MOTION_COST, _MISSED_COST, _IMPOSSIBLE = 8.0, 1.5, 9.0, 1e3
-_NEIGHBOUR_MISSED_COST = 6.0  # the same of a neighbour that is not seen again
 ENERGY_SPREAD = 0.7  # of ln(energy / expected energy)
-_ISOLATED_RADII = 2.2  # no neighbour is nearer
-_KNOWN_LOOK = 0.8  # correlation from which on a look is one of the views
-_EXPECTED_FRAMES = 3  # for which a velocity goes on
-_FADE = 0.9  # of the energy of a neighbour that is in one image with the robot, in a frame
-_SUM_LOW = 0.65  # least energy of such an image relative to the sum
-_GAIN, _RECENT_GAIN = 0.3, 0.2  # of the velocity; of the recent view, energy and spread
+KNOWN_LOOK = 0.8  # correlation from which on a look is one of the views
+RECENT_GAIN = 0.2  # of the recent view, energy and spread
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +186,7 @@ def candidates(
     region = view.around(box, scale)
     sign, noise = SIGNS[appearance.polarity], appearance.foreground_noise
     energy = energy_map(region.c, noise, sign, scale.energy)
-    found = peaks(energy, max(least_energy, _LEAST_ENERGY), scale.apart, 4 * _ALL)
+    found = peaks(energy, max(least_energy, LEAST_ENERGY), scale.apart, 4 * _ALL)
     if near_px is not None:
         distance = np.hypot(*(found[:, :2] - region.to_blocks(near_px)).T)
         found = found[np.argsort(distance, kind="stable")[:_NEAR]]
@@ -218,109 +209,6 @@ def candidates(
     blocks = table[:, :2]
     numbers = table[:, 3].astype(np.intp)
     return region, Candidates(blocks, region.to_px(blocks), table[:, 2], numbers, table[:, 4], table[:, 5:])
-
-
-@dataclass(frozen=True, slots=True)
-class ExpectedMotion:
-    """Expected position of the robot, after a track whose place was `place_px` (2,)."""
-
-    previous: Track
-    place_px: Floats
-    radius_px: float
-    frame_s: float  # since that track
-    expected_px: Floats  # (2,)
-    spread_px: float  # typical distance from there
-
-    @classmethod
-    def after(cls, previous: Track, place_px: Floats, radius_px: float, frame_s: float) -> ExpectedMotion:
-        """The motion since a track: its velocity goes on for three frames at most, then it may be anywhere near."""
-        frames = 1 + previous.lost_frames
-        moved = previous.velocity_px_s * frame_s * frames if previous.lost_frames < _EXPECTED_FRAMES else 0.0
-        spread_px = max(previous.spread_px, 0.15 * radius_px + 0.3) * frames
-        return cls(previous, place_px, radius_px, frame_s, place_px + moved, spread_px)
-
-
-def assign_objects(found: Candidates, motion: ExpectedMotion, range_px: float) -> tuple[int | None, Floats]:
-    """The candidate that is the robot when all objects of the frame before are assigned at once; None: no one is.
-
-    Besides the neighbours (k, 3) that are no candidate.
-    """
-    previous = motion.previous
-    count = len(found.energy)
-    neighbours = previous.neighbours_px.reshape(-1, 3)
-    if not count:
-        return None, neighbours
-    costs = np.full((1 + len(neighbours), count + 1 + len(neighbours)), _IMPOSSIBLE)
-    distance2 = ((found.px - motion.expected_px) ** 2).sum(axis=1)
-    costs[0, :count] = _SIMILARITY_COST * (1.0 - found.similarity) + _move_cost(
-        found, motion, distance2, previous.energy
-    )
-    costs[0, :count][distance2 > range_px**2] = _IMPOSSIBLE
-    costs[0, count] = _MISSED_COST
-    for row, (x, y, energy) in enumerate(neighbours.tolist(), 1):
-        distance2 = ((found.px - (x, y)) ** 2).sum(axis=1)
-        costs[row, :count] = _move_cost(found, motion, distance2, energy)
-        costs[row, count + row] = _NEIGHBOUR_MISSED_COST
-    from scipy.optimize import linear_sum_assignment  # not at start-up
-
-    chosen = linear_sum_assignment(costs)[1]
-    missed = neighbours[chosen[1:] >= count]
-    return (int(chosen[0]) if chosen[0] < count else None), missed
-
-
-def find_merged(
-    found: Candidates, which: int | None, motion: ExpectedMotion, missed: Floats
-) -> tuple[int, Floats, Floats] | None:
-    """The image that is the robot and missed neighbours (k, 3) together: it is near both and has the sum of energies.
-
-    Its number, and in px the place (2,) of the robot and those neighbours (k, 3); None: there is no such image.
-
-    `which` is the candidate that is the robot; None: the one nearest to where it is expected, which then may be taken
-    for a neighbour. Its centroid is that of all, and they lie to each other as before:
-        centroid = sum(E_i p_i) / sum(E_i), p_robot - p_i = expected - p_i before.
-    """
-    previous, radius_px = motion.previous, motion.radius_px
-    if which is None:
-        if not len(found.energy) or previous.lost_frames >= _EXPECTED_FRAMES:
-            return None
-        which = int(np.hypot(*(found.px - motion.expected_px).T).argmin())
-        missed = previous.neighbours_px.reshape(-1, 3)
-    elif found.similarity[which] >= _KNOWN_LOOK:
-        return None
-    centroid = found.px[which]
-    near = hidden_neighbours(missed, centroid, radius_px)
-    total = previous.energy + float(near[:, 2].sum())
-    if not len(near) or math.dist(centroid, motion.expected_px) > radius_px:
-        return None
-    # The second term: beside a much stronger neighbour the sum does not tell whether the robot is there.
-    if not _SUM_LOW < float(found.energy[which]) / total < 1.0 / _SUM_LOW or previous.energy < (1 - _SUM_LOW) * total:
-        return None
-    offsets = motion.expected_px - near[:, :2]
-    place_px = centroid + (near[:, 2:] * offsets).sum(axis=0) / total
-    return which, place_px, np.column_stack([place_px - offsets, near[:, 2]])
-
-
-def hidden_neighbours(missed: Floats, place_px: Floats, radius_px: float) -> Floats:
-    """Those of the missed neighbours (k, 3) that are at the robot's place: they may come out of its image again.
-
-    They fade, since one that has gone out of focus does not come out.
-    """
-    near = missed[np.hypot(*(missed[:, :2] - place_px).T) < radius_px]
-    kept = near[near[:, 2] > _LEAST_ENERGY]
-    return np.column_stack([kept[:, :2], _FADE * kept[:, 2]])
-
-
-def _move_cost(found: Candidates, motion: ExpectedMotion, distance2: Floats, energy: float) -> Floats:
-    """Cost (n,) of a move and of a change of energy: a heavy tail, because robots and neighbours jump at times."""
-    changed = np.abs(np.log(found.energy / max(energy, 1e-6)))
-    return _MOTION_COST * np.log1p(distance2 / motion.spread_px**2) + changed
-
-
-def similar(found: Candidates, which: int, motion: ExpectedMotion) -> bool:
-    """True if a candidate of unknown look is the robot by its place and energy: it has turned."""
-    ratio = float(found.energy[which]) / max(motion.previous.energy, 1e-6)
-    near = math.dist(found.px[which], motion.expected_px) < 1.5 * motion.radius_px
-    return motion.previous.lost_frames < _EXPECTED_FRAMES and near and 0.25 < ratio < 4.0
 
 
 def alone(found: Candidates, energy: float, least_score: float) -> int | None:
@@ -367,7 +255,7 @@ def updated_look(
 ) -> Appearance:
     """The appearance with the present look in it; itself if it stays."""
     views, half = appearance.views, appearance.views.shape[1] // 2
-    known = similarity >= _KNOWN_LOOK
+    known = similarity >= KNOWN_LOOK
     if (not isolated and similarity < 0.9) or (known and stamp_ns - appearance.stamp_ns < _UPDATE_NS):
         return appearance
     x, y = place.tolist()
@@ -375,36 +263,9 @@ def updated_look(
     if len(views) == 1:
         views = np.stack([views[0], patch])
     elif known:
-        recent = views[1] + np.float32(_RECENT_GAIN) * (patch - views[1])
+        recent = views[1] + np.float32(RECENT_GAIN) * (patch - views[1])
         views = np.concatenate([views[:1], recent[None], views[2:]])
     else:
         older = views[1:] if len(views) < VIEWS else np.concatenate([views[1:2], views[3:]])
         views = np.concatenate([views[:1], patch[None], older])
     return replace(appearance, stamp_ns=stamp_ns, views=views)
-
-
-def with_motion(track: Track, motion: ExpectedMotion, to_px: Floats, energy: float) -> Track:
-    """The track with its fields on the motion, after the robot went to a place (2,)."""
-    previous, dt = motion.previous, motion.frame_s
-    frames = 1 + previous.lost_frames
-    velocity = (to_px - motion.place_px) / (dt * frames) if dt > 0.0 else previous.velocity_px_s
-    missed_px = math.dist(to_px, motion.expected_px) / frames
-    ratio = max(energy, 1e-6) / max(previous.energy, 1e-6)
-    return replace(
-        track,
-        velocity_px_s=previous.velocity_px_s + _GAIN * (velocity - previous.velocity_px_s),
-        spread_px=previous.spread_px + _RECENT_GAIN * (missed_px - previous.spread_px),
-        energy=max(previous.energy, 1e-6) * ratio**_RECENT_GAIN,
-    )
-
-
-def neighbours_of(found: Candidates, robot: int | None) -> Floats:
-    """Place and energy (3 k,) of all candidates but the robot."""
-    rows = np.column_stack((found.px, found.energy))
-    return np.delete(rows, [] if robot is None else robot, axis=0).ravel()
-
-
-def is_isolated(neighbours_px: Floats, place_px: Floats, radius_px: float) -> bool:
-    """True if no neighbour is so near that it is in the robot's views."""
-    offsets = neighbours_px.reshape(-1, 3)[:, :2] - place_px
-    return not len(offsets) or float(np.hypot(*offsets.T).min()) > _ISOLATED_RADII * radius_px

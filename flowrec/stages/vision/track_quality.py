@@ -18,6 +18,7 @@ import numpy as np
 
 from flowrec.core import Appearance, Floats, Shift, Tick, Track, seconds, shift_px
 from flowrec.physics import Calibration, Robot
+from flowrec.stages.vision.assignment import EXPECTED_FRAMES
 from flowrec.stages.vision.foreground import correlation
 from flowrec.stages.vision.learned import ReducedScale
 
@@ -28,13 +29,11 @@ _FAST = 0.95  # quantile of the measured speeds that counts as the speed of the 
 # That a reversal at this speed may take it between two images: in a track that jumps often it is that of the jumps.
 _FARTHEST_RADII = 4.0
 _LEAST_STEPS = 5  # from which a speed is measured
-_GOES_ON_FRAMES = 3  # for which a velocity goes on, as in stages/vision/learned.py
 _CUT_RADII = 0.5  # a centre nearer to the border than this is that of a part of the body
 _LIKE_ENERGY = 2.0  # factor of the energy within which another body is as bright
 _GATE = 3.0  # mean distances from the expected place within which the robot is
-_BRIGHTER = (
-    4.0  # factor of the energy by which the robot does not change; stages/vision/learned.py follows one within it
-)
+# Factor of the energy by which the robot does not change; assignment.py follows one within it.
+_BRIGHTER = 4.0
 _ROUND, _ALIKE = 0.8, 0.5  # correlation of a view with itself turned, and with the first look
 _SETTLED = 10  # tracks after which the mean energy is that of the robot
 
@@ -87,7 +86,7 @@ class TrackQuality:
         step_s = track.since_s(last)
         moved_um = off_um = track.position_um - last.position_um
         if self._velocity is not None and len(self._steps_s):
-            off_um = moved_um - self._velocity * min(step_s, _GOES_ON_FRAMES * self._steps_s[-1])
+            off_um = moved_um - self._velocity * min(step_s, EXPECTED_FRAMES * self._steps_s[-1])
         self._steps_s.append(step_s)
         self._steps_um.append(math.hypot(*moved_um))
         self._off_um.append(math.hypot(*off_um))

@@ -7,7 +7,7 @@ Disc: positions that correlate with the template of a disc are candidates, and a
 precision. Near the last position the disc of the right size that fits best is the robot; in the whole channel it is the
 darkest of those, because debris is paler. It needs no help from the user.
 
-Learned appearance (learned.py): for a robot that a user has pointed at, and for bright ones.
+Learned appearance (learned.py, assignment.py): for a robot that a user has pointed at, and for bright ones.
 """
 
 from __future__ import annotations
@@ -21,6 +21,16 @@ import numpy as np
 
 from flowrec.core import Appearance, Floats, Frame, Range, Share, Track, UsageError
 from flowrec.physics import Calibration, Chip, Robot
+from flowrec.stages.vision.assignment import (
+    ExpectedMotion,
+    assign_objects,
+    find_merged,
+    hidden_neighbours,
+    is_isolated,
+    neighbours_of,
+    similar,
+    with_motion,
+)
 from flowrec.stages.vision.disc_search import (
     Disc,
     DiscSearch,
@@ -29,41 +39,17 @@ from flowrec.stages.vision.disc_search import (
     disc_pad_px,
     tracked_radius_px,
 )
-from flowrec.stages.vision.learned import (
-    Candidates,
-    ExpectedMotion,
-    View,
-    alone,
-    assign_objects,
-    candidates,
-    find_merged,
-    hidden_neighbours,
-    is_isolated,
-    locate_robot,
-    neighbours_of,
-    scale_of,
-    similar,
-    updated_look,
-    with_motion,
-)
+from flowrec.stages.vision.learned import Candidates, View, alone, candidates, locate_robot, scale_of, updated_look
 from flowrec.stages.vision.learning import box_of, brightest_spot, energy_of, learn, pixel_noise
 from flowrec.stages.vision.several import Expected, Sought, first_tracks, next_tracks
 from flowrec.stages.vision.tracers import TracerTracker
-from flowrec.stages.vision.trackers import TRACKERS, TrackingMethod, unseen
-from flowrec.stages.vision.walls import Box, Walls, box_around, seen_walls, walls_in_view
+from flowrec.stages.vision.trackers import TRACKERS, Footprint, TrackingMethod, unseen
+from flowrec.stages.vision.walls import Walls, box_around, clip_box, seen_walls, walls_in_view
 
 Polarity = Literal["dark", "bright", "auto"]
 _Pixel = Annotated[float, Range(-1e5, 1e5)]
 _LENIENT_SCORE, _LENIENT_LIKENESS = 0.85, 0.9  # of a disc that may be pale or beside a wall: debris has less
 _ENERGY_SHARE = 0.05  # least energy of a candidate relative to the robot's
-
-
-@dataclass(frozen=True, slots=True)
-class Footprint:
-    """The pixels that a tracker reads: those of Track.roi_px and no farther than `pad_px` around it."""
-
-    pad_px: int
-    everywhere_px: Box  # roi_px of a search in the whole channel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,7 +276,7 @@ class Tracker:
         if appearance.note:
             return scene.track(search, None), appearance
         x, y = appearance.centre_px.tolist()
-        box = _clip_box((x, y), 4.0 * view.radius_px, scene.walls.box)
+        box = clip_box((x, y), 4.0 * view.radius_px, scene.walls.box)
         found = candidates(view, appearance, box, 0.0, appearance.centre_px)[1]
         near = np.hypot(*(found.px - appearance.centre_px).T) < 0.7 * appearance.radius_px
         return replace(
@@ -316,7 +302,7 @@ class Tracker:
         near_px = max(self.search_px, 4.0 * radius_px, 6.0 * motion.spread_px)
         which, joined, missed = None, None, np.zeros((0, 3))
         for range_px in (math.inf,) if everywhere else (near_px, max(farthest_px, 1.5 * near_px)):
-            box = walls.box if everywhere else _clip_box(expected, range_px, walls.box)
+            box = walls.box if everywhere else clip_box(expected, range_px, walls.box)
             near = None if everywhere else motion.expected_px
             region, found = candidates(view, appearance, box, _ENERGY_SHARE * previous.energy, near)
             if everywhere:
@@ -409,17 +395,3 @@ class Tracker:
             size_tolerance=self.size_tolerance,
             candidates=self.candidates,
         )
-
-
-def move_neighbours(previous: Track, by_px: Floats) -> Track:
-    """A track as the next image shows it, which lies `by_px` (2,) farther: the neighbours are places in the image."""
-    if not previous.neighbours_px.size or not by_px.any():
-        return previous
-    moved = previous.neighbours_px.reshape(-1, 3) + np.array([by_px[0], by_px[1], 0.0])
-    return replace(previous, neighbours_px=moved.ravel())
-
-
-def _clip_box(centre: tuple[float, float], range_px: float, box: Box) -> Box:
-    """`box_around` that is empty, and not turned inside out, where the range lies beyond the box."""
-    x0, y0, x1, y1 = box_around(centre, min(range_px, 1e5), box)
-    return x0, y0, max(x1, x0), max(y1, y0)

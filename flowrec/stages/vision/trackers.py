@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from flowrec.core import Frame, Method, Methods, Track
 from flowrec.physics import Calibration, Chip, Robot
+from flowrec.stages.vision.walls import Box
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """The pixels that a tracker reads: those of Track.roi_px and no farther than `pad_px` around it."""
+
+    pad_px: int
+    everywhere_px: Box  # roi_px of a search in the whole channel
 
 
 class TrackingMethod(Protocol):

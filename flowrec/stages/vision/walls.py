@@ -71,6 +71,12 @@ def box_around(centre: tuple[float, float], range_px: float, box: Box) -> Box:
     return left, top, min(math.ceil(x + range_px) + 1, x1), min(math.ceil(y + range_px) + 1, y1)
 
 
+def clip_box(centre: tuple[float, float], range_px: float, box: Box) -> Box:
+    """`box_around` that is empty, and not turned inside out, where the range lies beyond the box."""
+    x0, y0, x1, y1 = box_around(centre, min(range_px, 1e5), box)
+    return x0, y0, max(x1, x0), max(y1, y0)
+
+
 def _mask_distance_px(mask: Bools) -> Floats32:
     """Signed distance (h, w) to the walls of a mask in its pixels, as `clearance_um` defines it.
 

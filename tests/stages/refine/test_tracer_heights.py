@@ -12,7 +12,7 @@ from flowrec.physics import ChipSettings, FlowSolver, load_chip, sample
 from flowrec.stages.refine import Assimilate, Refiner
 from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.flow_model import flow_model
-from flowrec.stages.refine.hypothesis import MOST_OBSERVATIONS, groups
+from flowrec.stages.refine.noise import MOST_OBSERVATIONS, groups
 from flowrec.stages.refine.observation_operator import observation_operator
 from flowrec.stages.refine.tracer_heights import ENTERED, EVEN, LEAST_PX, MOST, MOST_EACH, at_mean_height
 

@@ -17,7 +17,8 @@ from flowrec.bench.robot_tracking import by_flowrec, recorded_movies, row
 from flowrec.core import Appearance, Frame, Track
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages import Tracker, calibration_of, load_config
-from flowrec.stages.vision.learned import Candidates, ExpectedMotion, assign_objects
+from flowrec.stages.vision.assignment import ExpectedMotion, assign_objects
+from flowrec.stages.vision.learned import Candidates
 from flowrec.store import SessionReader
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.record import record
