@@ -25,9 +25,10 @@ import scipy  # its ndimage and spatial load at first use, not at start-up
 from flowrec.core import STD_PER_MAD, Bools, ChipError, Floats, Floats32, FlowError, Image, Ints
 from flowrec.measure.images import Levels, shrink
 from flowrec.measure.picture_registration import apart_px, fit_nearby, is_legible
+from flowrec.measure.wall_contours import ALONG_PX, WallContours
 from flowrec.measure.wall_fit import level_contrast
 from flowrec.measure.wall_search import move_chip
-from flowrec.physics import Calibration, Chip, check_point, median_width_um, smooth_contours, with_levels
+from flowrec.physics import Calibration, Chip, check_point, median_width_um, with_levels
 from flowrec.stages import ResolvedConfig, registration_of
 
 _STEP_PX = 0.125  # between the places that are compared, in px of the mask, as all lengths here
@@ -35,13 +36,11 @@ _OUT_PX, _IN_WIDTHS = 3.0, 0.7  # largest motion of a wall outwards; and inwards
 _WINDOW_WIDTHS, _WINDOW_PX = 0.3, (1.0, 2.0)  # half length of a profile: in median channel widths, but within this
 _STEPS_ALONG = 4  # by which neighbours may differ at most
 _STIFFNESS, _REST = 0.15, 0.01  # costs of a difference (px^2) between neighbours, and of a motion (px)
-_ALONG_PX = 1.0  # over which profiles are averaged along a wall
 _LIKE = 0.5  # correlation from which a wall counts as seen
 # Profiles' b and c over their a from which on light comes from one side: 0.30 and 0.57 in relief, under 0.1 in eleven
 # other looks of walls.
 _SIDED = 0.2
 _FAINT = 0.3  # contrast of a profile, relative to the median, below which it shows no wall
-_BORDER_PX = 2.0  # from the border of the mask: openings keep their place
 # Walls that differ by less (root mean square) are those of the mask: so far a right one is taken off. In pixels of the
 # mask or, where those are larger, of the camera; so is the next one.
 _NOISE_PX = 0.15
@@ -53,8 +52,6 @@ _ROUNDS, _STILL_PX = 6, 0.05  # of profile, walls and pose; until the pose moves
 # 82 to 85 % alike and 2.1 px off (root mean square), those of chips with walls up to a pixel off 97 % and 0.8 px.
 _LEAST_SEEN, _LEAST_WALL_PX, _MOST_WALL_PX = 0.9, 30, 1.5
 _UNKNOWN = 0.02  # motions that move walls by less, relative to the others, stay as stated: along a straight channel
-_REACH_PX = 6.0  # from a wall, up to which the side of it is that of the nearest point
-_DENSE = 8  # points of a wall per pixel, from which distances are taken
 # Points of a wall, and times the noise: a corner of a right mask is at most 1.1 px off over so many, an obstacle that
 # leaves half or two thirds of a channel 1.9 to 7 px.
 _STRETCH, _OBSTACLE = 7, 10.0
@@ -125,7 +122,7 @@ def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls 
     """
     if not is_legible(picture, chip):
         return None
-    contours = _Contours.of(chip)
+    contours = WallContours.of(chip)
     found = _follow(picture, contours, stated, sided=False)
     if found is None or found.sided > _SIDED:  # scale and place may be farther off than walls are sought
         nearby = fit_nearby(picture, chip, stated)
@@ -149,73 +146,6 @@ def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls 
     )
 
 
-class _Contours(NamedTuple):
-    """Points on the walls of a mask, a pixel apart, in order along each wall."""
-
-    chip: Chip
-    points: Floats  # (n, 2) x, y in px of the mask
-    inward: Floats  # (n, 2) unit normals, into the fluid
-    walls: list[tuple[slice, bool]]  # the points of each wall, and whether it is closed
-    inside: Bools  # (n,) away from the border of the mask
-
-    @classmethod
-    def of(cls, chip: Chip) -> _Contours:
-        points: list[Floats] = []
-        walls: list[tuple[slice, bool]] = []
-        first = 0
-        for contour, closed in smooth_contours(chip.mask):
-            each = _evenly(contour, closed, 1.0)
-            points.append(each)
-            walls.append((slice(first, first + len(each)), closed))
-            first += len(each)
-        every = np.concatenate(points) if points else np.zeros((0, 2))
-        size = np.array(chip.mask.shape[::-1])
-        border = np.minimum(every + 0.5, size - 0.5 - every).min(axis=1, initial=math.inf)
-        inward = np.concatenate([_normals(every[which], closed) for which, closed in walls] or [every])
-        return cls(chip, every, inward, walls, border > _BORDER_PX)
-
-    def along(self, values: Floats, sigma_px: float) -> Floats:
-        """Values (n, ...) of the points, averaged along each wall."""
-        averaged = np.empty_like(values)
-        for which, closed in self.walls:
-            mode = "wrap" if closed else "nearest"
-            averaged[which] = scipy.ndimage.gaussian_filter1d(values[which], sigma_px, axis=0, mode=mode)
-        return averaged
-
-    def levels(self, out_px: Floats) -> Floats32:
-        """(h, w) signed distances of the pixel centres to the walls, each moved outwards by (n,)."""
-        moved = self.points - out_px[:, None] * self.inward
-        dense = [(_evenly(moved[which], closed, 1.0 / _DENSE), closed) for which, closed in self.walls]
-        points = np.concatenate([each for each, _ in dense])
-        inward = np.concatenate([_normals(each, closed) for each, closed in dense])
-        mask = self.chip.mask
-        rows, columns = np.indices(mask.shape)
-        centres = np.stack((columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
-        distance, nearest = scipy.spatial.cKDTree(points).query(centres, distance_upper_bound=_REACH_PX)
-        near = np.isfinite(distance)
-        level = np.where(mask.ravel(), _REACH_PX, -_REACH_PX)
-        across = (centres[near] - points[nearest[near]]) * inward[nearest[near]]
-        level[near] = np.copysign(distance[near], across.sum(axis=1))
-        return np.asarray(level.reshape(mask.shape), np.float32)
-
-
-def _evenly(contour: Floats, closed: bool, step_px: float) -> Floats:
-    """Points (m, 2) a step apart along a contour (n, 2)."""
-    line = np.concatenate([contour, contour[:1]]) if closed else contour
-    at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    count = max(round(float(at[-1]) / step_px), 2)
-    places = np.linspace(0.0, at[-1], count, endpoint=not closed)
-    return np.stack([np.interp(places, at, line[:, axis]) for axis in (0, 1)], axis=1)
-
-
-def _normals(points: Floats, closed: bool) -> Floats:
-    """(n, 2) unit normals of a contour to its right, where the fluid is."""
-    smooth = scipy.ndimage.gaussian_filter1d(points, _ALONG_PX, axis=0, mode="wrap" if closed else "nearest")
-    along = np.roll(smooth, -1, 0) - np.roll(smooth, 1, 0) if closed else np.gradient(smooth, axis=0)
-    right = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    return np.asarray(right / np.maximum(np.hypot(*along.T), 1e-9)[:, None])
-
-
 class _Followed(NamedTuple):
     """Walls and pose near a first one."""
 
@@ -225,7 +155,7 @@ class _Followed(NamedTuple):
     sided: float  # size of the profiles' b and c over that of a
 
 
-def _follow(picture: Image, contours: _Contours, start: Calibration, sided: bool) -> _Followed | None:
+def _follow(picture: Image, contours: WallContours, start: Calibration, sided: bool) -> _Followed | None:
     """Walls and pose near a first one, in light from one side or not; None if too few of the walls look alike."""
     chip = contours.chip
     width_px = median_width_um(chip) / chip.um_per_px
@@ -285,7 +215,7 @@ def _level_picture(picture: Image, chip: Chip, start: Calibration, width_px: flo
 
 
 def _profiles(
-    image: Levels, step: int, contours: _Contours, calibration: Calibration, places: Ints, window: int
+    image: Levels, step: int, contours: WallContours, calibration: Calibration, places: Ints, window: int
 ) -> Floats32:
     """(n, m) grey levels across the walls, outwards: a window before the first place to one after the last.
 
@@ -296,7 +226,7 @@ def _profiles(
     at_px = ((calibration.to_px(at_um) + 0.5) / step - 0.5).astype(np.float32)
     columns, rows = (np.ascontiguousarray(at_px[..., axis]) for axis in (0, 1))
     seen = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan)
-    return np.asarray(contours.along(np.asarray(seen, np.float64), _ALONG_PX), np.float32)
+    return np.asarray(contours.along(np.asarray(seen, np.float64), ALONG_PX), np.float32)
 
 
 def _windows(profiles: Floats32, window: int) -> Floats32:
@@ -336,7 +266,7 @@ def _likeness(profiles: Floats32, expected: Floats32, usable: Bools) -> Floats:
     return np.asarray(both / np.maximum(np.sqrt(power), faint) / np.maximum(size, 1e-9), np.float64)
 
 
-def _move_walls(likeness: Floats, usable: Bools, places: Ints, contours: _Contours) -> Floats:
+def _move_walls(likeness: Floats, usable: Bools, places: Ints, contours: WallContours) -> Floats:
     """(n,) px by which each wall moves outwards."""
     cost = np.where(usable[:, None], 1.0 - likeness, 1.0) + _REST * np.abs(_STEP_PX * places)
     cost[~contours.inside] = np.abs(_STEP_PX * places)
@@ -347,7 +277,7 @@ def _move_walls(likeness: Floats, usable: Bools, places: Ints, contours: _Contou
         before, here, after = (each[np.arange(len(chosen)), chosen + step] for step in (-1, 0, 1))
         part = np.clip(0.5 * (before - after) / np.maximum(before - 2.0 * here + after, 1e-6), -1.0, 1.0)
         out_px[which] = _STEP_PX * (places[chosen] + part)
-    return np.where(contours.inside, contours.along(out_px, 0.7 * _ALONG_PX), 0.0)
+    return np.where(contours.inside, contours.along(out_px, 0.7 * ALONG_PX), 0.0)
 
 
 def _cheapest(cost: Floats, closed: bool) -> Ints:
@@ -370,7 +300,7 @@ def _cheapest(cost: Floats, closed: bool) -> Ints:
 
 
 def _move_pose(
-    calibration: Calibration, contours: _Contours, out_px: Floats, seen: Bools
+    calibration: Calibration, contours: WallContours, out_px: Floats, seen: Bools
 ) -> tuple[Calibration, Floats, float]:
     """The pose that leaves the walls least out (n,) px, what then is left, and how far it moves walls, in px."""
     points, inward = contours.points, contours.inward

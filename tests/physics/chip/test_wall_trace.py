@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+from flowrec.measure.wall_contours import WallContours
 from flowrec.measure.wall_trace import as_pictured, trace_walls
 from flowrec.physics import Calibration, ChipSettings, load_chip, with_wall_offset
 from flowrec.physics.flow.level_set import from_mask
@@ -95,6 +96,18 @@ def test_a_mask_that_is_too_narrow_or_too_wide_everywhere_is_corrected(offset_px
     right, wrong = levels(BIFURCATION.mask), levels(drawn.mask)
     assert abs((wrong - right)[beside].mean()) > 0.6
     assert abs((found.level_px - right)[beside].mean()) < 0.15
+
+
+@pytest.mark.parametrize("out_px", [-2.0, 1.0, 2.0])
+def test_walls_that_move_change_no_pixel_that_they_do_not_reach(out_px):
+    """Where channels meet at an acute angle, two walls that move apart from the fluid cross."""
+    contours = WallContours.of(VESSELS)
+    drawn, moved = (contours.levels(np.where(contours.inside, by, 0.0)) for by in (0.0, out_px))
+    beyond = np.abs(drawn) > abs(out_px) + 1.0
+    assert np.count_nonzero(beyond & VESSELS.mask) > 1_000
+    np.testing.assert_array_equal(moved[beyond] > 0.0, VESSELS.mask[beyond])
+    beside = np.abs(drawn) < 1.0
+    assert abs(np.median((moved - drawn)[beside]) - out_px) < 0.05
 
 
 def test_the_pose_in_a_mirror_image_is_found():
