@@ -3,17 +3,20 @@
 With the measured flow y_i at x_i, the robot's own motion r_i as it is assumed, and the flow v:
 
     y_i = v(x_i) + dv/dx (offset - scale (x_i - c) - angle J (x_i - c)) + (scale + angle J) v + scale r_i
-          + (gain + gain_k - hindrance (b_i - b)) r_i + heading J r_i + rolling(t_i) r_i
+          + (gain + gain_k - hindrance (b_i - b) + stepping(|r_i|)) r_i + heading J r_i + rolling(t_i) r_i
           + sphere(v) + walls(x_i) + v p(t_i) + local(x_i) + noise
 
-gain_k is what another robot, number k, rolls farther per revolution than the first one; rolling is of each robot. J
-turns from +x to +y, c is the mean of the places. b_i is the drag of the side walls on a sphere of the robot's radius,
-relative to the largest one, and b its mean: the gain is that of the robot where it was observed, and hindrance what
-differs nearer to or farther from a wall. sphere(v) is how a sphere lags behind the flow, sphere_between_walls.py. Where
-the radius is not stated (older sessions), b_i = exp(-(d_i - d) / (d / 2)) falls with the distance d_i to the wall, d is
-the least one that was observed, and the lag is carry b_i v - curved d^2 / 6 lap v. p is a change of the whole flow in
-time: slow wander, and a spectral line. `local` is the error of the grid. Each effect is linear in its unknowns around
-the flow and the registration in use, so the assimilation repeats with those that it found.
+gain_k is what another robot, number k, rolls farther per revolution than the first one; rolling is of each robot.
+stepping is what a robot near its step-out frequency f_c misses: beyond it, it follows 1 - sqrt(1 - (f_c / f)^2) of its
+turns (Adler), and f_c is known to a fifth. It is a random walk over the speed, from FOLLOWS of the highest one on, less
+its mean, which belongs to the gain. J turns from +x to +y, c is the mean of the places. b_i is the drag of the side
+walls on a sphere of the robot's radius, relative to the largest one, and b its mean: the gain is that of the robot
+where it was observed, and hindrance what differs nearer to or farther from a wall. sphere(v) is how a sphere lags
+behind the flow, sphere_between_walls.py. Where the radius is not stated (older sessions), b_i = exp(-(d_i - d) / (d /
+2)) falls with the distance d_i to the wall, d is the least one that was observed, and the lag is carry b_i v - curved
+d^2 / 6 lap v. p is a change of the whole flow in time: slow wander, and a spectral line. `local` is the error of the
+grid. Each effect is linear in its unknowns around the flow and the registration in use, so the assimilation repeats
+with those that it found.
 
 Walls that are off by w pixels (one standard deviation, each wall on its own) change the width of a cell of the channels
 by the fraction e = sqrt(2) w / width. In a channel at the same flow rate the mean speed changes by -e, the resistance
@@ -66,6 +69,8 @@ HELD = (0.3, 1.0)
 # Of the flow, one value a tracer: between plates 0.45 of those in view at first, 0.27 of those that came in later
 # (tracer_heights.py). In a deep channel less, with beads of other sizes and laws more.
 HEIGHT = (0.3, 0.5)
+STEPPING = (0.05, 1.3)  # of the own motion at the highest observed speed; with 0.1 maps of 11 surveys were as good
+FOLLOWS = 0.75  # of that speed, up to which a robot follows its field: with 0.5 likewise
 OFFSET_PX = (0.3, 1.0)  # registration to a fraction of a pixel of the mask
 SCALE = (0.006, 1.0)  # um per pixel of a camera
 ANGLE = (0.004, 0.8)  # rad
@@ -77,7 +82,7 @@ LINE = (0.04, 1.3)  # amplitude of a spectral line
 AS_STATED = 0.1  # of these sizes, for a chip that is as drawn and a robot and a camera that are as calibrated
 _STATED = (
     *("resistance", "walls", "offset", "scale", "angle"),
-    *("gain", "heading", "hindrance", "carry", "curved", "sphere"),
+    *("gain", "heading", "hindrance", "stepping", "carry", "curved", "sphere"),
 )
 # Of these sizes, where walls and registration were taken from an image (measure/wall_trace.py): 3 um are left of walls
 # that were 12 um off. In ten simulated flights 0.3 of all had a smaller CRPS than 1, 0.15, and 0.3 without resistance.
@@ -262,6 +267,7 @@ class Observed:
                 _effect("heading", HEADING, quarter_turn(own)[None]),
                 _effect("hindrance", self._hindrance_size(), -((self.near - self.near.mean())[:, None] * own)[None]),
             ]
+            found.append(Effect("stepping", *STEPPING, np.zeros((0, v.size)), self._stepping(own)))
             others = np.unique(self.robot[self.robot > 0.0])
             if len(others):
                 found.append(_effect("gain of others", OTHERS_GAIN, (self.robot == others[:, None])[:, :, None] * own))
@@ -320,6 +326,15 @@ class Observed:
     def _hindrance_size(self) -> tuple[float, float]:
         """Size of the hindrance of the own motion: median and ln_std."""
         return HINDRANCE if self.sphere is None else (HELD[0] * float(self.sphere.drag.max()), HELD[1])
+
+    def _stepping(self, own: Floats) -> Floats:
+        """(2 n, 2 n) covariance of what a robot misses of its own motion (n, 2), besides what it misses on the mean."""
+        speed = np.hypot(*own.T)
+        beyond = np.maximum(speed / max(float(speed.max()), 1e-9) - FOLLOWS, 0.0) / (1.0 - FOLLOWS)
+        alike = np.minimum(beyond[:, None], beyond)
+        mean = np.full_like(speed, 1.0 / max(np.count_nonzero(speed), 1)) * (speed > 0.0)
+        alike = alike - alike @ mean - (alike @ mean)[:, None] + mean @ alike @ mean
+        return np.asarray(own.ravel()[:, None] * own.ravel() * _of_components(alike))
 
     def _widening_flow(self, v: Floats) -> Floats:
         """(cells, n, 2) what walls that are a pixel off in a cell do to the flow v (n, 2), there and elsewhere."""

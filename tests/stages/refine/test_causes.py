@@ -51,7 +51,7 @@ def found(refined, name):
 def test_where_the_headings_never_vary_the_note_says_that_it_is_unknown_and_the_error_bars_contain_it(twin):
     case = twin(truth=(120.0, 0.0, 0.0))
     scores = []
-    for gain in (-0.14, 0.0, 0.14):
+    for gain in (-0.12, 0.0, 0.12):
         observed = flown(case, headings="along", gain=gain)
         refined = SETTINGS.refine(case.assumed, observed, case.chip, case.solver)
         value, std = found(refined, "um_per_rev_share")
@@ -59,7 +59,7 @@ def test_where_the_headings_never_vary_the_note_says_that_it_is_unknown_and_the_
         assert "um per revolution they tell to" in refined.note
         fast = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
         scores.append((refined.velocity_um_s - case.true.velocity_um_s)[fast] / refined.std_um_s[fast])
-    # Two of the three gains lie 1.75 standard deviations of the prior from what is stated.
+    # Two of the three gains lie 1.5 standard deviations of the prior from what is stated.
     assert np.mean(np.abs(np.concatenate(scores)) < 2.0) > 0.85
 
 
@@ -265,3 +265,21 @@ def test_walls_and_registration_of_an_image_leave_less_doubt_about_both_and_as_m
     doubted_less = {name for name in drawn if pictured[name] < 0.5 * drawn[name]}
     assert doubted_less == {"walls", "resistance", "offset", "scale", "angle"}
     assert all(pictured[name] == pytest.approx(drawn[name]) for name in ("boundary", "gain", "heading", "fluid"))
+
+
+@pytest.mark.parametrize("step_out_um_s", [145.0, 1e3])
+def test_a_robot_that_steps_out_at_its_highest_speed_is_not_taken_for_flow(twin, step_out_um_s):
+    """It goes to and fro, upstream at 150 um/s and downstream at 100; what it misses is Adler's equation's."""
+    case = twin(truth=(120.0, 0.0, 0.0))
+    observed = flown(case, headings="along")
+    v = sample(case.true, observed.position_um)
+    upstream = np.arange(len(v)) % 2 == 0
+    speed = np.where(upstream, 150.0, 100.0)
+    rolled = (np.where(upstream, -1.0, 1.0) * speed / np.hypot(*v.T))[:, None] * v
+    missed = np.sqrt(np.maximum(1.0 - (step_out_um_s / speed) ** 2, 0.0))
+    observed = replace(observed, flow_um_s=observed.flow_um_s - missed[:, None] * rolled, rolled_um_s=rolled)
+    refined = SETTINGS.refine(case.assumed, observed, case.chip, case.solver)
+    assert case.error(refined) < 0.06  # 0.18 where this is not among the causes
+    fast = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
+    off = (refined.velocity_um_s - case.true.velocity_um_s)[fast]
+    assert np.mean(np.abs(off / refined.std_um_s[fast]) < 2.0) > 0.85
