@@ -9,14 +9,14 @@ With the measured flow y_i at x_i, the robot's own motion r_i as it is assumed, 
 gain_k is what another robot, number k, rolls farther per revolution than the first one; rolling is of each robot.
 stepping is what a robot near its step-out frequency f_c misses: beyond it, it follows 1 - sqrt(1 - (f_c / f)^2) of its
 turns (Adler), and f_c is known to a fifth. It is a random walk over the speed, from FOLLOWS of the highest one on, less
-its mean, which belongs to the gain. J turns from +x to +y, c is the mean of the places. b_i is the drag of the side
-walls on a sphere of the robot's radius, relative to the largest one, and b its mean: the gain is that of the robot
-where it was observed, and hindrance what differs nearer to or farther from a wall. sphere(v) is how a sphere lags
-behind the flow, sphere_between_walls.py. Where the radius is not stated (older sessions), b_i = exp(-(d_i - d) / (d /
-2)) falls with the distance d_i to the wall, d is the least one that was observed, and the lag is carry b_i v - curved
-d^2 / 6 lap v. p is a change of the whole flow in time: slow wander, and a spectral line. `local` is the error of the
-grid. Each effect is linear in its unknowns around the flow and the registration in use, so the assimilation repeats
-with those that it found.
+its mean, which belongs to the gain, and of each robot. J turns from +x to +y, c is the mean of the places. b_i is the
+drag of the side walls on a sphere of the robot's radius, relative to the largest one, and b its mean: the gain is that
+of the robot where it was observed, and hindrance what differs nearer to or farther from a wall. sphere(v) is how a
+sphere lags behind the flow, sphere_between_walls.py. Where the radius is not stated (older sessions), b_i = exp(-(d_i -
+d) / (d / 2)) falls with the distance d_i to the wall, d is the least one that was observed, and the lag is carry b_i v
+- curved d^2 / 6 lap v. p is a change of the whole flow in time: slow wander, and a spectral line. `local` is the error
+of the grid. Each effect is linear in its unknowns around the flow and the registration in use, so the assimilation
+repeats with those that it found.
 
 Walls that are off by w pixels (one standard deviation, each wall on its own) change the width of a cell of the channels
 by the fraction e = sqrt(2) w / width. In a channel at the same flow rate the mean speed changes by -e, the resistance
@@ -330,12 +330,12 @@ class Observed:
         return HINDRANCE if self.sphere is None else (HELD[0] * float(self.sphere.drag.max()), HELD[1])
 
     def _stepping(self, own: Floats) -> Floats:
-        """(2 n, 2 n) covariance of what a robot misses of its own motion (n, 2), besides what it misses on the mean."""
+        """(2 n, 2 n) covariance of what each robot misses of its own motion (n, 2) besides the mean of that."""
         speed = np.hypot(*own.T)
         beyond = np.maximum(speed / max(float(speed.max()), 1e-9) - FOLLOWS, 0.0) / (1.0 - FOLLOWS)
-        alike = np.minimum(beyond[:, None], beyond)
-        mean = np.full_like(speed, 1.0 / max(np.count_nonzero(speed), 1)) * (speed > 0.0)
-        alike = alike - alike @ mean - (alike @ mean)[:, None] + mean @ alike @ mean
+        same = (self.robot[:, None] == self.robot).astype(np.float64)
+        less_mean = np.eye(len(same)) - same / same.sum(axis=1)
+        alike = less_mean @ (same * np.minimum(beyond[:, None], beyond)) @ less_mean.T
         return np.asarray(own.ravel()[:, None] * own.ravel() * _of_components(alike))
 
     def _widening_flow(self, v: Floats) -> Floats:

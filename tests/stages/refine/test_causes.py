@@ -279,7 +279,7 @@ def test_a_robot_that_steps_out_at_its_highest_speed_is_not_taken_for_flow(twin,
     missed = np.sqrt(np.maximum(1.0 - (step_out_um_s / speed) ** 2, 0.0))
     observed = replace(observed, flow_um_s=observed.flow_um_s - missed[:, None] * rolled, rolled_um_s=rolled)
     refined = SETTINGS.refine(case.assumed, observed, case.chip, case.solver)
-    assert case.error(refined) < 0.06  # 0.18 where this is not among the causes
+    assert case.error(refined) < 0.08  # 0.18 where this is not among the causes
     fast = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
     off = (refined.velocity_um_s - case.true.velocity_um_s)[fast]
     assert np.mean(np.abs(off / refined.std_um_s[fast]) < 2.0) > 0.85
