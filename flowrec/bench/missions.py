@@ -22,7 +22,7 @@ import typer
 
 from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import FigureFile, Results, choose_names, vessel_cases
-from flowrec.bench.mission_tables import Row, compare_times, summary
+from flowrec.bench.mission_tables import Row, compare_times, show, summary  # noqa: F401  bench_verb calls show
 from flowrec.bench.world_flights import WORLDS as FAULTS
 from flowrec.bench.world_flights import Given, as_seen, in_world
 from flowrec.core import (
