@@ -4,7 +4,8 @@ The numerics of the first are version 1, in which the velocities of a flow field
 loop and its planner made of the recorded inputs, fields included, is still computed to the last digit; of the two
 fields themselves, the flow behind them is still the same. The second, of the moderate world, has a survey by
 information, stretch by stretch, and numerics version 3. The third has the settled format, its digest chained over
-the chunks, and numerics version 5; as long as those hold, every message of it is computed again to the last digit.
+the chunks, and numerics version 5; the fourth has the walls of its first image, and numerics version 6: as long as
+those hold, every message of it is computed again to the last digit.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ from flowrec.verbs import session_replay as verb
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 MODERATE = GOLDEN.with_name("golden_moderate.mcap")
 SETTLED = GOLDEN.with_name("golden_numerics5.mcap")
+TRACED = GOLDEN.with_name("golden_numerics6.mcap")
 BY_OTHER_NUMERICS = {"/flow/assumed", "/flow/refined"}
 
 
-@pytest.mark.parametrize("path", [GOLDEN, MODERATE, SETTLED])
+@pytest.mark.parametrize("path", [GOLDEN, MODERATE, SETTLED, TRACED])
 def test_a_golden_session_is_small_and_says_nothing_of_the_machine_it_was_made_on(path: Path) -> None:
     assert path.stat().st_size < 3_000_000
     facts = SessionReader(path).header.provenance
@@ -69,8 +71,10 @@ def test_the_golden_session_of_the_moderate_world_replays_the_same_but_for_what_
     assert done.recorded.mission.outcome == "reached"
 
 
-def test_the_golden_session_of_the_settled_format_is_intact_and_replays_the_same() -> None:
-    done = verb.replay_session(SETTLED, Change(), verify=True)
+@pytest.mark.parametrize(("path", "walls"), [(SETTLED, "smooth"), (TRACED, "grey")])
+def test_a_golden_session_of_the_settled_format_is_intact_and_replays_the_same(path: Path, walls: str) -> None:
+    done = verb.replay_session(path, Change(), verify=True)
+    assert done.session.chip.walls == walls
     lines = done.lines()
     assert done.comparison.same and done.digest[0], lines
     assert "consistent with their digest" in " ".join(lines)
