@@ -136,6 +136,18 @@ class _There:
         return _of_components(np.exp(-np.abs(time_s[:, None] - time_s) / length_s))
 
     @cached_property
+    def stepping(self) -> Floats:
+        """(2 n, 2 n) covariance of what each robot misses of its own motion besides the mean of that."""
+        assert self.operator.rolled_um_s is not None
+        own, robot = self.operator.rolled_um_s, self.operator.robot
+        speed = np.hypot(*own.T)
+        beyond = np.maximum(speed / max(float(speed.max()), 1e-9) - FOLLOWS, 0.0) / (1.0 - FOLLOWS)
+        same = (robot[:, None] == robot).astype(np.float64)
+        less_mean = np.eye(len(same)) - same / same.sum(axis=1)
+        alike = less_mean @ (same * np.minimum(beyond[:, None], beyond)) @ less_mean.T
+        return np.asarray(own.ravel()[:, None] * own.ravel() * _of_components(alike))
+
+    @cached_property
     def local_error(self) -> Floats:
         """(2 n, 2 n) covariance of the model's own error: neighbours share it."""
         std = self.operator.predict(np.repeat(self.model.error_std[:, None], 2, axis=1))[:, 0]
@@ -269,10 +281,10 @@ class Observed:
                 _effect("heading", HEADING, quarter_turn(own)[None]),
                 _effect("hindrance", self._hindrance_size(), -((self.near - self.near.mean())[:, None] * own)[None]),
             ]
-            found.append(Effect("stepping", *STEPPING, np.zeros((0, v.size)), self._stepping(own)))
-            others = np.unique(self.robot[self.robot > 0.0])
+            found.append(Effect("stepping", *STEPPING, np.zeros((0, v.size)), self.there.stepping))
+            others = np.unique(here.robot[here.robot > 0.0])
             if len(others):
-                found.append(_effect("gain of others", OTHERS_GAIN, (self.robot == others[:, None])[:, :, None] * own))
+                found.append(_effect("gain of others", OTHERS_GAIN, (here.robot == others[:, None])[:, :, None] * own))
         if time_s is not None:
             along = v.ravel()[:, None] * v.ravel()
             none = np.zeros((0, v.size))
@@ -283,8 +295,8 @@ class Observed:
             if rolled is not None:
                 pushed = [(vectors.ravel()[:, None] * vectors.ravel()) for vectors in (own, quarter_turn(own))]
                 alike = self.there.alike_in_time(ROLLING_S)
-                if self.robot.any():
-                    alike = alike * _of_components(self.robot[:, None] == self.robot)
+                if here.robot.any():
+                    alike = alike * _of_components(here.robot[:, None] == here.robot)
                 found.append(Effect("rolling", *ROLLING, none, sum(pushed) * alike))
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
@@ -319,24 +331,9 @@ class Observed:
         tracer = self.operator.tracer
         return np.ones((self.operator.count, 1)) if tracer is None else (tracer[:, None] < 0.0).astype(np.float64)
 
-    @property
-    def robot(self) -> Floats:
-        """(n,) number of the robot that was observed; below 0 for a tracer."""
-        tracer = self.operator.tracer
-        return np.zeros(self.operator.count) if tracer is None else -1.0 - tracer
-
     def _hindrance_size(self) -> tuple[float, float]:
         """Size of the hindrance of the own motion: median and ln_std."""
         return HINDRANCE if self.sphere is None else (HELD[0] * float(self.sphere.drag.max()), HELD[1])
-
-    def _stepping(self, own: Floats) -> Floats:
-        """(2 n, 2 n) covariance of what each robot misses of its own motion (n, 2) besides the mean of that."""
-        speed = np.hypot(*own.T)
-        beyond = np.maximum(speed / max(float(speed.max()), 1e-9) - FOLLOWS, 0.0) / (1.0 - FOLLOWS)
-        same = (self.robot[:, None] == self.robot).astype(np.float64)
-        less_mean = np.eye(len(same)) - same / same.sum(axis=1)
-        alike = less_mean @ (same * np.minimum(beyond[:, None], beyond)) @ less_mean.T
-        return np.asarray(own.ravel()[:, None] * own.ravel() * _of_components(alike))
 
     def _widening_flow(self, v: Floats) -> Floats:
         """(cells, n, 2) what walls that are a pixel off in a cell do to the flow v (n, 2), there and elsewhere."""

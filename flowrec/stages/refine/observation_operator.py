@@ -39,6 +39,11 @@ class ObservationOperator:
         return len(self.std_um_s)
 
     @property
+    def robot(self) -> Floats:
+        """(n,) number of the robot that was observed; below 0 for a tracer."""
+        return np.zeros(self.count) if self.tracer is None else -1.0 - self.tracer
+
+    @property
     def rms_um_s(self) -> float:
         """Root mean square of the measured speed."""
         return float(np.sqrt((self.flow_um_s**2).sum(axis=1).mean()))
