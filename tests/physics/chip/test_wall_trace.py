@@ -110,6 +110,20 @@ def test_walls_that_move_change_no_pixel_that_they_do_not_reach(out_px):
     assert abs(np.median((moved - drawn)[beside]) - out_px) < 0.05
 
 
+def test_where_a_closed_wall_begins_changes_no_pixel():
+    contours = WallContours.of(VESSELS)
+    order = np.arange(len(contours.points))
+    assert any(closed for _, closed in contours.walls)
+    for which, closed in contours.walls:
+        if closed:
+            order[which] = np.roll(order[which], (which.stop - which.start) // 2)
+    turned = contours._replace(**{name: getattr(contours, name)[order] for name in ("points", "inward", "inside")})
+    for out_px in (-2.0, 2.0):
+        once, again = (each.levels(np.where(each.inside, out_px, 0.0)) for each in (contours, turned))
+        clear = np.abs(once) > 0.1
+        np.testing.assert_array_equal(once[clear] > 0.0, again[clear] > 0.0)
+
+
 def test_the_pose_in_a_mirror_image_is_found():
     scene = Scene(BIFURCATION, "dark lines", 0.0, mirror=True)
     assert scene.off_um(trace_walls(scene.image, BIFURCATION, scene.stated).calibration) < 1.5

@@ -237,16 +237,20 @@ def test_another_robot_has_a_response_of_its_own_which_is_not_taken_for_flow(twi
     assert np.mean(np.abs(off) < 2.0) > 0.9
 
 
-def test_robots_leave_their_courses_each_for_itself(twin):
+def test_robots_leave_their_courses_and_step_out_each_for_itself(twin):
     case = twin()
-    one, two = flown(case, seed=1, count=20), flown(case, seed=2, count=20)
+    one, two = (
+        replace(each, rolled_um_s=np.linspace(0.5, 1.0, 20)[:, None] * each.rolled_um_s)
+        for each in (flown(case, seed=seed, count=20) for seed in (1, 2))
+    )
     joined = one.with_robots({1: two})
     settings = Assimilate()
     model = flow_model(settings, settings.model, case.chip, case.solver)
     operator = observation_operator(joined, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
     effects = {effect.name: effect for effect in Observed.of(model, operator).effects(model.base, None)}
-    rolling, wander = effects["rolling"].kernel, effects["wander 2 s"].kernel
-    assert np.abs(rolling[:40, :40]).max() > 0.0 and not rolling[:40, 40:].any()
+    wander = effects["wander 2 s"].kernel
+    for own in (effects["rolling"].kernel, effects["stepping"].kernel):
+        assert np.abs(own[:40, :40]).max() > 0.0 and not own[:40, 40:].any()
     assert np.abs(wander[:40, 40:]).max() > 0.0, "the pump is one"
     (others,) = effects["gain of others"].columns
     assert not others[:40].any() and others[40:].any()
