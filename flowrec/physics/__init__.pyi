@@ -49,4 +49,7 @@ from .flow.solver import FlowSolver as FlowSolver
 from .flow.uncertainty import Doubts as Doubts, FlowUncertainty as FlowUncertainty, Registration as Registration
 from .flow.velocity_stencil import pixel_weights as pixel_weights, velocity_at as velocity_at
 from .flow.wall_offset import with_levels as with_levels, with_wall_offset as with_wall_offset
-from .robot import Robot as Robot, RobotSettings as RobotSettings, USUAL_DELAY_S as USUAL_DELAY_S
+from .robot import (
+    ROLLING_BY_DRAG as ROLLING_BY_DRAG, Robot as Robot, RobotSettings as RobotSettings, USUAL_DELAY_S as USUAL_DELAY_S,
+)
+from .sphere_between_walls import ChannelWidths as ChannelWidths, SphereBetweenWalls as SphereBetweenWalls

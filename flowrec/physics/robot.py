@@ -14,6 +14,9 @@ from flowrec.core import Applied, Floats, FlowField, PositiveShare, Range, Usage
 
 _SIGNIFICANT = 2.0  # standard deviations
 _NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are meant for
+# What a refinement found of the um per revolution, over the stated one, less 1: without side walls, and by how much it
+# changes per unit of their drag (sphere_between_walls.py).
+ROLLING_BY_DRAG = ("um_per_rev_open_share", "um_per_rev_drag_share")
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
 
 _Radius = Annotated[float, Range(0.05, 1e4)]
@@ -141,6 +144,17 @@ class Robot(RobotSettings):
             return self
         slower = min(1.0 + change, 1.0)
         return replace(self, max_speed_um_s=slower * self.max_speed_um_s, um_per_rev=(1.0 + change) * self.um_per_rev)
+
+    def um_per_rev_at(self, drag: float, refined: FlowField) -> float | None:
+        """What a refinement found of the um per revolution of this robot where side walls have a drag on it.
+
+        `drag` is over Stokes' drag, that of `SphereBetweenWalls`. None: no effect of the walls is significant.
+        """
+        in_open, by_drag = (refined.parameter(name) for name in ROLLING_BY_DRAG)
+        if in_open is None or by_drag is None or abs(by_drag[0]) <= _SIGNIFICANT * by_drag[1]:
+            return None
+        share = 1.0 + in_open[0] + drag * by_drag[0]
+        return share * self.um_per_rev if share > 0.0 else None
 
     @staticmethod
     def course_turn(refined: FlowField | None) -> Floats | None:

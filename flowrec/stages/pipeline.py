@@ -32,10 +32,21 @@ from flowrec.core import (
     TopicTable,
     Track,
     UsageError,
+    bilinear,
     nearest_pixel,
     seconds,
 )
-from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, on_chip, sample
+from flowrec.physics import (
+    Calibration,
+    ChannelWidths,
+    Chip,
+    FlowSolver,
+    Robot,
+    SphereBetweenWalls,
+    clearance_um,
+    on_chip,
+    sample,
+)
 from flowrec.stages.config import ResolvedConfig, calibration_of
 from flowrec.stages.control import Coils, Controller
 from flowrec.stages.control.axes_check import leg_velocity, steady_velocity, watch
@@ -69,6 +80,7 @@ class Pipeline:
     robot: Robot  # in proportion to the frequency, see physics.Robot
     response: Robot  # as the coils drive it
     clearance_um: Floats32  # (h, w) from each pixel centre to the nearest wall, negative in solid
+    widths: ChannelWidths
     image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
     image_bits: int  # depth of their pixels
     stabiliser: Stabiliser
@@ -97,12 +109,14 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     """The stages of a resolved configuration on its chip."""
     config.tracker.refuse_unfit()
     config.pump.refuse_unfit(chip, config.streams, inertia=config.flow.convection, tracers=config.tracker.tracers)
+    walls_um = clearance_um(chip.mask, chip.um_per_px)
     return Pipeline(
         chip=chip,
         calibration=calibration_of(config, chip),
         robot=config.robot.proportional(),
         response=config.robot,
-        clearance_um=clearance_um(chip.mask, chip.um_per_px),
+        clearance_um=walls_um,
+        widths=ChannelWidths.of(chip.mask, walls_um / chip.um_per_px),
         image_shape=config.camera.shape,
         image_bits=config.camera.bits,
         stabiliser=config.stabilise,
@@ -156,6 +170,24 @@ def _place_on_chip(estimate: Estimate, refined: FlowField | None) -> Estimate:
     if refined is None or refined.registration is None:
         return estimate
     return replace(estimate, position_um=on_chip(refined.registration, estimate.position_um))
+
+
+def _between_walls(p: Pipeline, last: Tick, refined: FlowField | None, known: Robot) -> Robot:
+    """The known robot with the um per revolution that a refinement found for the place where it was a tick ago."""
+    if not p.refiner.correct_robot or refined is None or last.estimate is None:
+        return known
+    point = _place_on_chip(last.estimate, refined).position_um / p.chip.um_per_px
+    if not np.isfinite(point).all():
+        return known
+    point = np.clip(point, 0.0, np.array(p.clearance_um.shape[::-1]) - 1.0)
+    near_px = np.array([bilinear(p.clearance_um, *point.tolist()) / p.chip.um_per_px])
+    sphere = SphereBetweenWalls.of(p.robot.radius_um / p.chip.um_per_px, near_px, p.widths.at(point[None]))
+    found = p.robot.um_per_rev_at(float(sphere.drag[0]), refined)
+    if found is None:
+        return known
+    # At a higher frequency than the fastest one by which the robot is stated to go it may step out.
+    slower = min(found / known.um_per_rev, 1.0)
+    return replace(known, um_per_rev=found, max_speed_um_s=slower * known.max_speed_um_s)
 
 
 @functools.lru_cache(maxsize=2)
@@ -253,12 +285,11 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         known, seen = p.robot.learned_from(tick.refined), flow
     else:
         known, seen = p.robot, None if flow is None else _without_registration(flow)
+    here = _between_walls(p, last, tick.refined, known)
     turn = known.course_turn(tick.refined) if p.refiner.correct_heading else None
     rolled = p.response.proportional_turns(last.applied, inputs.applied)
     applied = rolled if turn is None else replace(rolled, turns=turn @ rolled.turns)
-    estimate = p.observer.estimate(last.estimate, track, applied, known, seen, last.health)
-    # The robot with the estimated um_per_rev, if the observer estimates it.
-    robot = known if estimate.um_per_rev is None else replace(known, um_per_rev=estimate.um_per_rev)
+    estimate = p.observer.estimate(last.estimate, track, applied, here, seen, last.health)
     # Sessions recorded before step-out was monitored replay without it.
     looked = applied if applied.image_since_ns is not None else None
     # Observations, their predictions and the pictures keep to the registration as stated.
@@ -266,12 +297,11 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     wall_um = _wall_um(p, placed.position_um)
     health = last.health
     if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
-        health = p.health.watch(health, last.estimate, estimate, seen, known, looked, wall_um)
-    robot = robot.limited_to(health.limit_hz)
+        health = p.health.watch(health, last.estimate, estimate, seen, here, looked, wall_um)
     mapless, measured = last.mapless, estimate
     if p.sampler.without_map:
         # Observations are those of the robot as stated: what a refinement finds of it, the next one finds again.
-        corrected = known is not p.robot or turn is not None
+        corrected = here is not p.robot or turn is not None
         mapless = p.observer.without_map(
             last.mapless, last.estimate, estimate, track, rolled, p.robot, corrected=corrected
         )
@@ -289,6 +319,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     if p.tracker.tracers:
         at_nominal = None if pump is None else partial(p.pump.stretches_at_nominal, pump)
         tracer_flow = collect_stretches(last.tracer_flow, last.tracers, sight.tracers, at_nominal)
+    if estimate.um_per_rev is not None:  # the observer estimates it
+        known = here = replace(known, um_per_rev=estimate.um_per_rev)
+    known, here = known.limited_to(health.limit_hz), here.limited_to(health.limit_hz)
     lap("observe")
     axes, driven_um_s = _axes(p, last, tick, track, rolled)
     hand_share = _hand_share(inputs)
@@ -301,7 +334,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         route,
         inputs.operator,
         last.demand,
-        robot,
+        known,
         inputs.applied,
         p.tracker.not_found_note(appearance),
         appearance is not None and bool(appearance.note),
@@ -313,7 +346,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     )
     if mission.by_hand:
         driven_um_s = np.zeros(2) if hand_share is None else None
-    robot = robot.slowed_to(mission.speed_limit_um_s).slowed_to(None if walls is None else walls.limit_um_s)
+    robot = here.slowed_to(mission.speed_limit_um_s).slowed_to(None if walls is None else walls.limit_um_s)
     demand = p.controller.control(
         last.demand,
         mission,

@@ -9,7 +9,7 @@ import pytest
 
 import flowrec
 from flowrec.core import Outcome, Phase
-from flowrec.physics import sample
+from flowrec.physics import ROLLING_BY_DRAG, sample
 from flowrec.stages import Inputs, assemble, step
 
 
@@ -80,6 +80,49 @@ def test_what_a_refinement_found_of_the_robot_corrects_observer_and_coils_and_no
     assert flown(-0.02, std=0.02).estimate.same_as(plain.estimate), "no more than its error"
     stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_robot=False))
     assert flown(-0.2, pipeline=stated).estimate.same_as(plain.estimate)
+
+
+@pytest.mark.slow("flies two missions")
+def test_beside_walls_observer_and_coils_take_the_um_per_revolution_that_was_found_there_and_the_mission_that_of_all(
+    navigation,
+):
+    pipeline, ticks = navigation
+    able = []
+
+    class Watched:
+        """The mission, which notes the speed limit of the robot that it is given."""
+
+        observes, check_axes = pipeline.mission.observes, False
+
+        def update(self, *given):
+            able.append(given[8].speed_limit_um_s)
+            return pipeline.mission.update(*given)
+
+    def flown(by_drag, std=0.001, pipeline=pipeline):
+        names = ("um_per_rev_share", *ROLLING_BY_DRAG)
+        found = replace(ticks[3].field, parameter_names="; ".join(names), parameters=np.array([0.0, 0.0, by_drag]))
+        last = replace(ticks[3], refined=replace(found, parameter_std=np.array([0.1, 0.0, std])))
+        return after(replace(pipeline, mission=Watched()), last, ticks[4:30])
+
+    plain, slower = flown(0.0), flown(-0.2)
+    rolled, rolls = (np.hypot(*tick.estimate.rolled_um_s) for tick in (plain, slower))
+    drag = (1.0 - rolls / rolled) / 0.2  # what the stages take for the drag where the robot is
+    chip, x_um, y_um = pipeline.chip, *plain.estimate.position_um
+    near = pipeline.clearance_um[round(y_um / chip.um_per_px), round(x_um / chip.um_per_px)]
+    s = pipeline.robot.radius_um / near
+    of_one_wall = 1.0 / (1.0 - 9.0 / 16.0 * s + s**3 / 8.0) - 1.0
+    assert 0.9 * of_one_wall < drag < 2.1 * of_one_wall
+    turns = [tick.currents.frequency_hz / np.hypot(*tick.demand.velocity_um_s) for tick in (plain, slower)]
+    assert turns[1] == pytest.approx(turns[0] / (1.0 - 0.2 * drag), rel=0.02)
+    robot = pipeline.robot
+    highest_hz = robot.max_speed_um_s / robot.um_per_rev
+    assert plain.currents.frequency_hz < 0.9 * highest_hz, "or there is nothing to limit"
+    assert flown(-1.2).currents.frequency_hz <= highest_hz * (1.0 + 1e-9), "a higher one may make it step out"
+    assert np.ptp(able) < 1e-9, "a robot beside a wall is no slower robot: the mission would plan anew at each wall"
+    assert slower.observations.same_as(plain.observations)
+    assert flown(-0.2, std=0.2).estimate.same_as(plain.estimate), "no more than its error"
+    stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_robot=False))
+    assert flown(-0.2, pipeline=stated).estimate.same_as(flown(0.0, pipeline=stated).estimate)
 
 
 def test_the_course_that_a_refinement_found_turns_observer_and_coils_and_no_observation(navigation):

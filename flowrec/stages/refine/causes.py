@@ -36,12 +36,11 @@ from functools import cached_property
 import numpy as np
 
 from flowrec.core import Floats, cells_at
-from flowrec.physics import clearance_um
+from flowrec.physics import ChannelWidths, SphereBetweenWalls, clearance_um
 from flowrec.stages.refine.channel_cells import curvature
 from flowrec.stages.refine.evidence import Effect
 from flowrec.stages.refine.flow_model import FlowModel
 from flowrec.stages.refine.observation_operator import ObservationOperator
-from flowrec.stages.refine.sphere_between_walls import SphereBetweenWalls
 
 # Median and ln_std of the size of each effect.
 BOUNDARY = (1.0, 0.3)  # in the prior standard deviations of the settings
@@ -201,7 +200,8 @@ class Observed:
         if operator.radius_px is None:
             near = np.exp(-np.maximum(distance - least, 0.0) / (NEAR_SHARE * least))
         else:
-            sphere = SphereBetweenWalls.of(operator.radius_px, mask, clearance, operator.points, distance)
+            widths = ChannelWidths.of(mask, clearance).at(operator.points)
+            sphere = SphereBetweenWalls.of(operator.radius_px, distance, widths)
             near = sphere.drag / float(sphere.drag.max())
         cells = model.cells[:, here.pixels[:, 0]].toarray()
         there = _There(model, here)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowrec.core import Floats, FlowField
-from flowrec.physics import Chip
+from flowrec.physics import ROLLING_BY_DRAG, Chip
 from flowrec.stages.refine.causes import LINE_NAME, WALL_BIAS_NAME, WANDER_S
 from flowrec.stages.refine.disturbances import SHAKE
 from flowrec.stages.refine.hypothesis import HypothesisFit
@@ -172,6 +172,7 @@ def _values(one: HypothesisFit) -> dict[str, tuple[float, float]]:
         mean, covariance = one.unknowns(effect)
         if len(mean):
             result[name] = (factor * float(mean[0]), factor * float(np.sqrt(covariance[0, 0])))
+    result |= _rolling_by_drag(one)
     mean, covariance = one.unknowns("offset")
     for axis, index in (("x", 0), ("y", 1)):
         result[f"offset_{axis}_um"] = (px * float(mean[index]), px * float(np.sqrt(covariance[index, index])))
@@ -192,6 +193,20 @@ def _values(one: HypothesisFit) -> dict[str, tuple[float, float]]:
             std = float(np.sqrt(((size**2 * one.posterior.ln_size_std[chosen]) ** 2).sum())) / max(total, 1e-12)
             result[name] = (total, std)
     return result
+
+
+def _rolling_by_drag(one: HypothesisFit) -> dict[str, tuple[float, float]]:
+    """The um per revolution over the stated one, less 1, as a line over the drag of the side walls: at 0, and per unit.
+
+    The drag is over Stokes' drag, `SphereBetweenWalls.drag`. Nothing where the robot's radius is not stated.
+    """
+    mean, covariance = one.unknowns("gain", "hindrance")
+    if one.observed.sphere is None or not len(mean):
+        return {}
+    near, per_near = one.observed.near, 1.0 / float(one.observed.sphere.drag.max())
+    line = np.array([[1.0, float(near.mean())], [0.0, -per_near]])
+    stds = np.sqrt(np.diag(line @ covariance @ line.T))
+    return dict(zip(ROLLING_BY_DRAG, zip((line @ mean).tolist(), stds.tolist(), strict=True), strict=True))
 
 
 def _amplitude(mean: Floats, covariance: Floats) -> tuple[float, float]:

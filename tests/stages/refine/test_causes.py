@@ -6,8 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from flowrec.core import cells_at
 from flowrec.core.messages import Observations
-from flowrec.physics import with_levels
+from flowrec.physics import ROLLING_BY_DRAG, ChannelWidths, SphereBetweenWalls, with_levels
 from flowrec.physics.chip.clearance import clearance_um
 from flowrec.physics.flow.sampling import sample
 from flowrec.stages.refine import Assimilate, Refiner
@@ -16,7 +17,6 @@ from flowrec.stages.refine.disturbances import frequencies_hz, held_back, likeli
 from flowrec.stages.refine.evidence import Effect, EffectModel
 from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.observation_operator import observation_operator
-from flowrec.stages.refine.sphere_between_walls import SphereBetweenWalls
 
 SETTINGS = Refiner(assimilate=Assimilate(doubt_walls=False, doubt_depth=False))
 
@@ -181,7 +181,8 @@ def test_a_sphere_between_walls_follows_published_limits():
     clearance = clearance_um(mask, 1.0)
     for gap, carried, drag in ((0.5431, 0.92185, 1.5675), (2.7622, 0.99436, 1.1738)):
         near = 4.0 * (1.0 + gap)
-        sphere = SphereBetweenWalls.of(4.0, mask, clearance, np.array([[4.0, 1.5 + near]]), np.array([near]))
+        widths = ChannelWidths.of(mask, clearance).at(np.array([[4.0, 1.5 + near]]))
+        sphere = SphereBetweenWalls.of(4.0, np.array([near]), widths)
         assert sphere.near_px + sphere.far_px == pytest.approx(400.0, abs=1.5)
         assert 1.0 - sphere.lag == pytest.approx(carried, abs=0.015)
         assert 1.0 + sphere.drag == pytest.approx(drag, abs=0.08)
@@ -189,6 +190,16 @@ def test_a_sphere_between_walls_follows_published_limits():
     middle = SphereBetweenWalls(4.0, np.array([8.0]), np.array([8.0]))
     v, laplacian = np.array([[90.0, 0.0]]), np.array([[-2.0 * 90.0 / 8.0**2, 0.0]])
     assert middle.transport_slip(v, laplacian)[0] == pytest.approx([-90.0 * 0.25 / 3.0, 0.0])
+
+
+def test_the_width_of_a_channel_is_that_at_the_place_up_to_its_corners():
+    mask = np.zeros((60, 80), bool)
+    mask[5:11] = mask[20:50] = True  # channels of 6 and 30 pixels
+    places = np.array([[0.0, 5.2], [40.0, 7.5], [79.0, 10.4], [0.0, 20.4], [40.0, 34.5], [79.0, 49.3]])
+    for turned, points in ((mask, places), (mask.T, places[:, ::-1])):
+        widths = ChannelWidths.of(turned, clearance_um(turned, 1.0))
+        assert widths.at(points) == pytest.approx([6, 6, 6, 30, 30, 30], abs=1.1)
+        assert widths.at(np.array([[15.0, 15.0]])) == pytest.approx(0.5)  # in a wall
 
 
 def test_hindrance_and_lag_are_those_of_a_sphere_where_its_radius_is_stated(twin):
@@ -199,6 +210,23 @@ def test_hindrance_and_lag_are_those_of_a_sphere_where_its_radius_is_stated(twin
     refined = SETTINGS.refine(case.assumed, replace(observed, radius_um=25.0), case.chip, case.solver)
     assert "sphere_share" in refined.parameter_names and "carry_share" not in refined.parameter_names
     assert case.error(refined) < 0.04
+
+
+def test_what_a_robot_rolls_is_found_as_a_line_over_the_drag_of_the_side_walls(twin):
+    case, radius_px = twin(), 3.0
+    observed = replace(flown(case, count=120), radius_um=radius_px * case.chip.um_per_px)
+    points = observed.position_um / case.chip.um_per_px
+    near = cells_at(points, case.chip.mask.shape).interpolate(clearance_um(case.chip.mask, 1.0))
+    widths = ChannelWidths.of(case.chip.mask, clearance_um(case.chip.mask, 1.0)).at(points)
+    drag = SphereBetweenWalls.of(radius_px, near, widths).drag
+    rolled = observed.rolled_um_s
+    slower = replace(observed, flow_um_s=observed.flow_um_s + (0.05 - 0.3 * drag)[:, None] * rolled)
+    refined = SETTINGS.refine(case.assumed, slower, case.chip, case.solver)
+    for name, true in zip(ROLLING_BY_DRAG, (0.05, -0.3), strict=True):
+        value, std = found(refined, name)
+        assert abs(value - true) < 3.0 * std and std < 0.1, name
+    (in_open, _), (by_drag, _), (mean, _) = (found(refined, name) for name in (*ROLLING_BY_DRAG, "um_per_rev_share"))
+    assert in_open + by_drag * drag.mean() == pytest.approx(mean, abs=0.03)
 
 
 def test_observations_without_motion_and_time_are_assimilated_as_those_of_older_sessions(twin):

@@ -19,9 +19,36 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats
+from flowrec.core import Bools, Floats
 
-_MOST_PAIRS = 2_000_000  # of a point and a disc that are compared at once, for the memory that they take
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelWidths:
+    """Widths of the channels of a chip: that of the largest disc in the fluid that holds a place.
+
+    This is the local thickness of Hildebrand and Rueegsegger (1997).
+    """
+
+    radii_px: NDArray[np.floating]  # of the largest disc around each pixel, with a margin of `reach_px` + 1 pixels
+    reach_px: int  # no disc whose centre is farther away holds a place
+
+    @classmethod
+    def of(cls, mask: Bools, clearance_px: NDArray[np.floating]) -> ChannelWidths:
+        """The channels of a mask (h, w); `clearance_px` (h, w) is the distance of pixels to the nearest wall."""
+        radii = np.where(mask, np.clip(clearance_px, 0.5, max(mask.shape)), 0.0)
+        reach = int(np.ceil(radii.max(initial=0.0)))
+        return cls(np.pad(radii, reach + 1), reach)
+
+    def at(self, points: Floats) -> Floats:
+        """(n,) widths in px at points (n, 2) in px; half a pixel where no disc holds the point."""
+        window = np.arange(-self.reach_px, self.reach_px + 2)
+        widths = []
+        for column, row in points:
+            first_row, first_column = int(row), int(column)
+            radii = self.radii_px[first_row + 1 :, first_column + 1 :][: len(window), : len(window)]
+            away = ((first_row + window - row) ** 2)[:, None] + (first_column + window - column) ** 2
+            widths.append(2.0 * np.where(away <= radii**2, radii, 0.25).max())
+        return np.array(widths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,26 +60,10 @@ class SphereBetweenWalls:
     far_px: Floats  # (n,) to the wall on the other side of the channel
 
     @classmethod
-    def of(
-        cls, radius_px: float, mask: NDArray[np.bool_], clearance_px: NDArray[np.floating], points: Floats, near: Floats
-    ) -> SphereBetweenWalls:
-        """The sphere at points (n, 2) in px, which are at the distances (n,) from the nearest wall.
-
-        A channel is as wide as the largest disc in it that holds the point: the local thickness of Hildebrand and
-        Rueegsegger (1997). `clearance_px` (h, w) is the distance of pixels to the nearest wall.
-        """
-        radii = np.where(mask, np.maximum(clearance_px, 0.5), 0.0)
-        reach = int(np.ceil(radii.max(initial=0.0)))  # no disc whose centre is farther away holds a point
-        around, window = np.pad(radii, reach + 1), np.arange(-reach, reach + 2)
-        widths = []
-        for part in np.array_split(points, 1 + len(points) * len(window) ** 2 // _MOST_PAIRS):
-            corner = part.astype(np.intp)
-            rows, columns = (corner[:, axis, None] + window for axis in (1, 0))
-            discs = around[(rows + reach + 1)[:, :, None], (columns + reach + 1)[:, None, :]]
-            away = ((rows - part[:, 1:]) ** 2)[:, :, None] + ((columns - part[:, :1]) ** 2)[:, None, :]
-            widths.append(2.0 * np.where(away <= discs**2, discs, 0.25).max(axis=(1, 2)))
-        near = np.maximum(near, radius_px)
-        return cls(radius_px, near, np.maximum(np.concatenate(widths) - near, near))
+    def of(cls, radius_px: float, near_px: Floats, width_px: Floats) -> SphereBetweenWalls:
+        """The sphere at the distances (n,) from the nearest wall, in channels of the widths (n,)."""
+        near_px = np.maximum(near_px, radius_px)
+        return cls(radius_px, near_px, np.maximum(width_px - near_px, near_px))
 
     @property
     def drag(self) -> Floats:
