@@ -148,13 +148,16 @@ class Robot(RobotSettings):
     def um_per_rev_at(self, drag: float, refined: FlowField) -> float | None:
         """What a refinement found of the um per revolution of this robot where side walls have a drag on it.
 
-        `drag` is over Stokes' drag, that of `SphereBetweenWalls`. None: no effect of the walls is significant.
+        `drag` is over Stokes' drag, that of `SphereBetweenWalls`. None: no effect of the walls is significant, or it is
+        none of drag, which slows a sphere that is pulled through open fluid by 1 per unit, and one over a floor less.
         """
         in_open, by_drag = (refined.parameter(name) for name in ROLLING_BY_DRAG)
         if in_open is None or by_drag is None or abs(by_drag[0]) <= _SIGNIFICANT * by_drag[1]:
             return None
-        share = 1.0 + in_open[0] + drag * by_drag[0]
-        return share * self.um_per_rev if share > 0.0 else None
+        in_open_share = 1.0 + in_open[0]
+        if not -in_open_share <= by_drag[0] < 0.0 or in_open_share + drag * by_drag[0] <= 0.0:
+            return None
+        return (in_open_share + drag * by_drag[0]) * self.um_per_rev
 
     @staticmethod
     def course_turn(refined: FlowField | None) -> Floats | None:
