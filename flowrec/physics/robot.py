@@ -17,6 +17,9 @@ _NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that the settings are mean
 # What a refinement found of the um per revolution, over the stated one, less 1: without side walls, and by how much it
 # changes per unit of their drag (sphere_between_walls.py).
 ROLLING_BY_DRAG = ("um_per_rev_open_share", "um_per_rev_drag_share")
+# The latter of a roller is -1 / (F + D) at a drag D of 0.5, where its floor has F = 2.2 to 3.4 times Stokes' drag
+# (Goldman, Cox and Brenner 1967, at gaps of a tenth to a hundredth of its radius); robots of other kinds spread more.
+_ROLLER_BY_DRAG = (-0.3, 0.1)
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
 
 _Radius = Annotated[float, Range(0.05, 1e4)]
@@ -151,13 +154,17 @@ class Robot(RobotSettings):
         `drag` is over Stokes' drag, that of `SphereBetweenWalls`. None: no effect of the walls is significant, or it is
         none of drag, which slows a sphere that is pulled through open fluid by 1 per unit, and one over a floor less.
         """
-        in_open, by_drag = (refined.parameter(name) for name in ROLLING_BY_DRAG)
-        if in_open is None or by_drag is None or abs(by_drag[0]) <= _SIGNIFICANT * by_drag[1]:
+        everywhere, in_open, by_drag = (refined.parameter(name) for name in ("um_per_rev_share", *ROLLING_BY_DRAG))
+        if everywhere is None or in_open is None or by_drag is None:
             return None
-        in_open_share = 1.0 + in_open[0]
-        if not -in_open_share <= by_drag[0] < 0.0 or in_open_share + drag * by_drag[0] <= 0.0:
+        found, std = by_drag
+        if abs(found) <= _SIGNIFICANT * std or not -1.0 - in_open[0] <= found < 0.0:
             return None
-        return (in_open_share + drag * by_drag[0]) * self.um_per_rev
+        seen_drag = (everywhere[0] - in_open[0]) / found  # the mean of those that the robot was observed with
+        roller, spread = _ROLLER_BY_DRAG
+        weight = spread**2 / (spread**2 + std**2)
+        share = 1.0 + everywhere[0] + (weight * found + (1.0 - weight) * roller) * (drag - seen_drag)
+        return share * self.um_per_rev if share > 0.0 else None
 
     @staticmethod
     def course_turn(refined: FlowField | None) -> Floats | None:

@@ -121,6 +121,8 @@ def test_beside_walls_observer_and_coils_take_the_um_per_revolution_that_was_fou
     assert np.ptp(able) < 1e-9, "a robot beside a wall is no slower robot: the mission would plan anew at each wall"
     assert slower.observations.same_as(plain.observations)
     assert flown(-0.2, std=0.2).estimate.same_as(plain.estimate), "no more than its error"
+    unsure = np.hypot(*flown(-0.6, std=0.1).estimate.rolled_um_s)
+    assert 1.0 - unsure / rolled == pytest.approx(0.45 * drag, rel=0.05), "half way to what is known of rollers"
     for no_drag in (0.2, -1.5):
         assert flown(no_drag).estimate.same_as(plain.estimate), "walls neither push a robot nor stop it"
     stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_robot=False))
