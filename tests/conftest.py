@@ -8,8 +8,8 @@ import os
 import pickle
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 from unittest import mock
@@ -66,6 +66,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             assert mark.args and isinstance(mark.args[0], str), f"{item.nodeid}: pytest.mark.slow says why"
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """One worker rewrites a file of tests and compiles what it imports; the others then read what it has stored."""
+    with alone(collector.path) if isinstance(collector, pytest.Module) else nullcontext():
+        return (yield)
+
+
 def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
@@ -74,7 +83,7 @@ def pytest_collection_finish() -> None:
 @contextmanager
 def alone(lock: Path) -> Iterator[None]:
     """One process at a time."""
-    with lock.open("a") as file:
+    with lock.open("r" if lock.exists() else "a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 

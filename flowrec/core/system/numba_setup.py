@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import logging
 import os
 import shutil
 import sys
@@ -75,8 +76,12 @@ class Kernel:
 
 @functools.cache
 def _register() -> None:
-    """Tell numba that a kernel which is called by another is what it compiles of it."""
+    """Tell numba that a kernel which is called by another is what it compiles of it, and not to log how."""
     from numba.extending import typeof_impl
+
+    # pymmcore_plus sets the level of the root logger to DEBUG. Then the messages of numba's passes take a third of a
+    # compilation.
+    logging.getLogger("numba").setLevel(logging.WARNING)
 
     @typeof_impl.register(Kernel)
     def _(kernel: Kernel, context: Any) -> Any:
