@@ -286,12 +286,14 @@ def _cheapest(cost: Floats, closed: bool) -> Ints:
     line = np.concatenate([cost[len(cost) - again :], cost, cost[:again]]) if again else cost
     steps = np.arange(-_STEPS_ALONG, _STEPS_ALONG + 1)
     stiff = (_STIFFNESS * (_STEP_PX * steps) ** 2)[:, None]
-    total, came = line[0], np.zeros(line.shape, np.intp)
+    came = np.zeros(line.shape, np.intp)
+    padded = np.pad(line[0], _STEPS_ALONG, constant_values=np.inf)
+    total = padded[_STEPS_ALONG:-_STEPS_ALONG]
+    neighbours = np.lib.stride_tricks.sliding_window_view(padded, len(total))
     for number in range(1, len(line)):
-        padded = np.pad(total, _STEPS_ALONG, constant_values=np.inf)
-        options = np.lib.stride_tricks.sliding_window_view(padded, line.shape[1]) + stiff
+        options = neighbours + stiff
         came[number] = options.argmin(axis=0)
-        total = options.min(axis=0) + line[number]
+        total[:] = options.min(axis=0) + line[number]
     path = np.empty(len(line), np.intp)
     path[-1] = int(total.argmin())
     for number in range(len(line) - 1, 0, -1):

@@ -42,7 +42,6 @@ def initial_edge_px(radius_px: float) -> float:
     return math.hypot(0.9, 0.06 * radius_px)
 
 
-@compiled
 def fit_disc(
     image: Image | Floats32,
     distance_px: Floats32,
@@ -59,7 +58,15 @@ def fit_disc(
     likeness sqrt(1 - residual / variance around the background), 0 to 1; 0 if there are too few pixels.
     """
     limit = fit_radius(radius_px, edge_px)
-    across, down, grey = block_means(image, distance_px, margin_px, x, y, limit, step)
+    means = block_means(image, distance_px, margin_px, x, y, limit, step)
+    return _fit(*means, x, y, radius_px, edge_px, step)  # of its own: it takes seconds to compile for a kind of image
+
+
+@compiled
+def _fit(
+    across: Floats, down: Floats, grey: Floats, x: float, y: float, radius_px: float, edge_px: float, step: int
+) -> tuple[float, float, float, float, float]:
+    """`fit_disc` for the means of blocks, each (n,), at (x + across, y + down)."""
     trial = _initial(across, down, grey, radius_px, edge_px)
     if trial[_DARKNESS] <= 0.0 or len(grey) < 2 * _PARAMETERS:
         return x, y, radius_px, 0.0, 0.0

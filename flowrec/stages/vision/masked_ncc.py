@@ -37,7 +37,6 @@ def template(radius_px: float, step: int) -> Floats32:
     return pattern
 
 
-@compiled
 def masked_ncc(
     image: Image | Floats32,
     distance_px: Floats32,
@@ -53,15 +52,32 @@ def masked_ncc(
     the clearance can not hold the centre and are -1. `pattern`: (n, n) of mean 0, at the scale of the reduced image;
     see `template`.
     """
-    height, width = image.shape
     x0, y0 = box[0], box[1]
     columns, rows = (box[2] - x0 + step - 1) // step, (box[3] - y0 + step - 1) // step
-    size = pattern.shape[0]
-    half = size // 2
+    half = pattern.shape[0] // 2
     tall, wide = rows + 2 * half, columns + 2 * half
-    grey, square, weight, whole = _weighted_blocks(
-        image, distance_px, x0 - half * step, y0 - half * step, wide, tall, step, margin_px
-    )
+    blocks = _weighted_blocks(image, distance_px, x0 - half * step, y0 - half * step, wide, tall, step, margin_px)
+    # A kernel of its own: it takes seconds to compile for a kind of image.
+    return _correlation(*blocks, distance_px, x0, y0, step, clearance_px, pattern)
+
+
+@compiled
+def _correlation(
+    grey: Floats32,
+    square: Floats32,
+    weight: Floats32,
+    whole: Bools,
+    distance_px: Floats32,
+    x0: int,
+    y0: int,
+    step: int,
+    clearance_px: float,
+    pattern: Floats32,
+) -> Floats32:
+    """`masked_ncc` for the blocks of `_weighted_blocks`, half a pattern more than the box on each side."""
+    height, width = distance_px.shape
+    size = pattern.shape[0]
+    rows, columns = grey.shape[0] - size + 1, grey.shape[1] - size + 1
     correlation = np.full((rows, columns), -1.0, np.float32)
     middle = (step - 1) // 2
     area = np.float32(size * size)
