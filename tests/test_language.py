@@ -1,12 +1,15 @@
-"""The words of the sources: one class a name, docstrings that state a result, functions that fit on a screen."""
+"""The words of the sources: one class a name, docstrings that state a result, short functions, keys that exist."""
 
 from __future__ import annotations
 
 import ast
 import re
 from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from functools import cache
+from pathlib import Path
 
+from flowrec.stages import Config
 from tests.sources import PACKAGE, tree_of
 
 LONGEST = 60  # lines of a function without its docstring
@@ -145,3 +148,41 @@ def test_a_number_is_explained_by_its_name_or_the_comment_of_its_paragraph() -> 
 
     assert names("# Limits.\nA = 1\nB = 2\n\nLEAST_UM = 3.0\nD = 4  # of five\nE = F\n") == []
     assert names("# Limits.\nA = 1\n\nB = -2.0\nC: int = 1 << 3\nD, E_S = 1, 2\n") == ["B", "C", "D"]
+
+
+KEY = re.compile(r"(?<![\w/.*{])([a-z_]{2,}(?:\.[a-z_0-9]+)+)")
+
+
+def keys(settings: object, prefix: str = "") -> set[str]:
+    found = set()
+    for field in fields(settings):  # type: ignore[arg-type]
+        value, key = getattr(settings, field.name), prefix + field.name
+        found |= {key, *(keys(value, f"{key}.") if is_dataclass(value) else ())}
+    return found
+
+
+def messages(source: Path) -> list[str]:
+    """What is raised, warned of or said, as written in the source."""
+    found = []
+    for node in ast.walk(tree_of(source)):
+        called = getattr(node.func, "id", getattr(node.func, "attr", "")) if isinstance(node, ast.Call) else ""
+        told = node.exc if isinstance(node, ast.Raise) else node if called in ("warn", "say", "bad", "odd") else None
+        if told is not None:
+            found += [s.value for s in ast.walk(told) if isinstance(s, ast.Constant) and isinstance(s.value, str)]
+    return found
+
+
+def test_every_key_that_a_message_names_exists() -> None:
+    known = keys(Config())
+    named = {key: text for source in PACKAGE.rglob("*.py") for text in messages(source) for key in KEY.findall(text)}
+    assert len(named) > 20
+    settings = {key: text for key, text in named.items() if not (key.startswith("flowrec.") or key.endswith(".py"))}
+    assert {key: text for key, text in settings.items() if key not in known} == {}
+
+
+def test_every_key_that_the_readme_names_exists() -> None:
+    known, text = keys(Config()), (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    sections = {field.name for field in fields(Config())}
+    named = {key.rstrip("._") for key in KEY.findall(text) if key.split(".")[0] in sections}
+    files = {key for key in named if key.endswith((".png", ".csv", ".toml", ".mcap"))}
+    assert named - known - files == set()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import math
 import re
 import tomllib
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, replace
 from functools import reduce
 from operator import attrgetter
 from pathlib import Path
@@ -27,7 +26,6 @@ from flowrec.store import SessionReader
 from flowrec.verbs import prepare
 from flowrec.verbs.run_summary import Recorded
 from tests.conftest import run
-from tests.sources import PACKAGE, tree_of
 
 
 def test_a_configuration_survives_its_own_toml() -> None:
@@ -101,44 +99,6 @@ def test_a_goal_in_a_wall_or_outside_or_at_no_place_of_the_chip_is_refused() -> 
     for goal, named in (("[0.0, 0.0]", "goal"), ("[1e6, 0.0]", "goal"), ("outlet:9", "outlet:9.*inlet, outlet")):
         with pytest.raises(UsageError, match=named):
             resolve(with_sets(config, [f"mission.goal={goal}"]), chip)
-
-
-KEY = re.compile(r"(?<![\w/.*{])([a-z_]{2,}(?:\.[a-z_0-9]+)+)")
-
-
-def keys(settings: object, prefix: str = "") -> set[str]:
-    found = set()
-    for field in fields(settings):  # type: ignore[arg-type]
-        value, key = getattr(settings, field.name), prefix + field.name
-        found |= {key, *(keys(value, f"{key}.") if is_dataclass(value) else ())}
-    return found
-
-
-def messages(source: Path) -> list[str]:
-    """What is raised, warned of or said, as written in the source."""
-    found = []
-    for node in ast.walk(tree_of(source)):
-        called = getattr(node.func, "id", getattr(node.func, "attr", "")) if isinstance(node, ast.Call) else ""
-        told = node.exc if isinstance(node, ast.Raise) else node if called in ("warn", "say", "bad", "odd") else None
-        if told is not None:
-            found += [s.value for s in ast.walk(told) if isinstance(s, ast.Constant) and isinstance(s.value, str)]
-    return found
-
-
-def test_every_key_that_a_message_names_exists() -> None:
-    known = keys(Config())
-    named = {key: text for source in PACKAGE.rglob("*.py") for text in messages(source) for key in KEY.findall(text)}
-    assert len(named) > 20
-    settings = {key: text for key, text in named.items() if not (key.startswith("flowrec.") or key.endswith(".py"))}
-    assert {key: text for key, text in settings.items() if key not in known} == {}
-
-
-def test_every_key_that_the_readme_names_exists() -> None:
-    known, text = keys(Config()), (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    sections = {field.name for field in fields(Config())}
-    named = {key.rstrip("._") for key in KEY.findall(text) if key.split(".")[0] in sections}
-    files = {key for key in named if key.endswith((".png", ".csv", ".toml", ".mcap"))}
-    assert named - known - files == set()
 
 
 def last_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:

@@ -68,11 +68,12 @@ class Scene:
     ("chip", "look", "most_px"),
     [
         (BIFURCATION, "dirty", 0.25),
-        (BIFURCATION, "relief", 0.3),
+        pytest.param(BIFURCATION, "relief", 0.3, marks=LOOK),
         *(
             pytest.param(chip, look, 0.35, marks=LOOK)
             for chip in (BIFURCATION, VESSELS)
             for look in ("dark lines", "thin bright lines", "phase edges", "dye", "ink", "uneven", "noisy", "relief")
+            if (chip, look) != (BIFURCATION, "relief")
         ),
     ],
     ids=lambda value: getattr(value, "name", None),
@@ -150,29 +151,31 @@ def test_along_a_straight_channel_the_chip_stays_where_it_is_stated():
     assert found.um_per_px == pytest.approx(scene.stated.um_per_px, rel=2e-3)
 
 
-NOISE = np.random.default_rng(0).normal(0.0, 1.0, SIZE_PX[::-1])
-SMOOTH = map_coordinates(NOISE[::8, ::8], np.indices(SIZE_PX[::-1]) / 8.0, order=3, mode="nearest")
-RIGHT = Scene(BIFURCATION, "dark lines", 0.0).image
-PICTURES = {
-    "noise": 128.0 + 20.0 * NOISE,
-    "blurred noise": 128.0 + 40.0 * SMOOTH,
-    "light from the left": np.tile(np.linspace(60.0, 200.0, SIZE_PX[0]), (SIZE_PX[1], 1)),
-    "another chip": Scene(VESSELS, "dark lines", 0.0).image.astype(np.float64),
-    "upside down": RIGHT[::-1].astype(np.float64),
-    "half hidden": np.where(np.arange(SIZE_PX[0]) < SIZE_PX[0] // 2, 128.0 + 8.0 * NOISE, RIGHT),
-}
+def another_picture(shown):
+    """A picture that does not show the bifurcation where it is stated."""
+    noise = np.random.default_rng(0).normal(0.0, 1.0, SIZE_PX[::-1])
+    if shown == "blurred noise":
+        smooth = map_coordinates(noise[::8, ::8], np.indices(SIZE_PX[::-1]) / 8.0, order=3, mode="nearest")
+        return 128.0 + 40.0 * smooth
+    if shown == "light from the left":
+        return np.tile(np.linspace(60.0, 200.0, SIZE_PX[0]), (SIZE_PX[1], 1))
+    if shown == "another chip":
+        return Scene(VESSELS, "dark lines", 0.0).image
+    right = Scene(BIFURCATION, "dark lines", 0.0).image
+    hidden = np.where(np.arange(SIZE_PX[0]) < SIZE_PX[0] // 2, 128.0 + 8.0 * noise, right)
+    return right[::-1] if shown == "upside down" else hidden
 
 
 @pytest.mark.parametrize(
     "shown",
     [
-        *("blurred noise", "another chip", "half hidden"),
-        *(pytest.param(each, marks=LOOK) for each in ("noise", "light from the left", "upside down")),
+        *("another chip", "half hidden"),
+        *(pytest.param(each, marks=LOOK) for each in ("blurred noise", "light from the left", "upside down")),
     ],
 )
 def test_a_picture_that_does_not_show_the_chip_changes_nothing(shown):
     config = resolve(load_config(None, []), BIFURCATION)
-    image = PICTURES[shown].clip(0.0, 255.0).astype(np.uint8)
+    image = another_picture(shown).clip(0.0, 255.0).astype(np.uint8)
     kept, chip, said = as_pictured(config, BIFURCATION, image)
     assert kept is config
     assert chip is BIFURCATION
