@@ -26,7 +26,15 @@ GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("exported")
     names = {"mp4": "a.mp4", "mp4_plain": "b.mp4", "tiff": "c.ome.tif", "csv": "tables"}
-    return {kind: flowrec.export(GOLDEN, folder / name, file_format=kind) for kind, name in names.items()}
+
+    class Exported(dict[str, Path]):
+        """Each is made when a test first asks for it."""
+
+        def __missing__(self, kind: str) -> Path:
+            self[kind] = made = flowrec.export(GOLDEN, folder / names[kind], file_format=kind)
+            return made
+
+    return Exported()
 
 
 @pytest.mark.slow("exports and reads a whole session")

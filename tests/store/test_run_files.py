@@ -1,6 +1,7 @@
 """Names of the files of a run. A run in parts is read as if it had never been split; each part is readable alone."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -88,9 +89,15 @@ def whole(tmp_path_factory):
     return SessionReader(path)
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return in_parts(tmp_path_factory.mktemp("parts") / "x.mcap", [11, 12, 40])
+
+
 @pytest.fixture
-def run(tmp_path):
-    in_parts(tmp_path / "x.mcap", [11, 12, 40])
+def run(written, tmp_path):
+    for file in written:
+        shutil.copy(file, tmp_path)
     return tmp_path / "x.mcap"
 
 

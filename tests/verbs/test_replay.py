@@ -171,9 +171,9 @@ def test_planted_hidden_state_passes_from_the_start_and_is_caught_from_the_middl
 
     for module in ("flowrec.verbs.preparation", "flowrec.verbs.session_replay"):
         monkeypatch.setattr(f"{module}.assemble", planted)
-    path = record(load_config(None, [*SMALL, "duration_s=4"]), tmp_path / "planted.mcap").path
+    path = record(load_config(None, [*SMALL, "duration_s=2"]), tmp_path / "planted.mcap").path
     assert verb.replay_session(path, Change(), verify=True).comparison.identical
-    resumed = verb.replay_session(path, Change(), from_s=2.0, verify=True)
+    resumed = verb.replay_session(path, Change(), from_s=1.0, verify=True)
     assert not resumed.comparison.identical
     assert resumed.comparison.first is not None
     assert resumed.comparison.first.topic == "/robot/estimate"
