@@ -41,7 +41,7 @@ def test_no_pixel_is_read_beyond_the_footprint_and_some_are_at_its_end(
     for right, bottom in ((201, 201), (202 + step, 201 + step)):
         box = (200, 200, right, bottom)
         seen = Watched(400, 400)
-        masked_ncc.py_func(seen, open_water, box, step, 1.0, 0.7 * nominal, template(nominal, step))
+        masked_ncc(seen, open_water, box, step, 1.0, 0.7 * nominal, template(nominal, step))
         middle = 0.5 * (step - 1)
         for x in (200 + middle, 200 + middle + step * ((right - 200 + step - 1) // step - 1)):
             for y in (200 + middle, 200 + middle + step * ((bottom - 200 + step - 1) // step - 1)):
