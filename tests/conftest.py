@@ -21,12 +21,10 @@ from numba.core.dispatcher import Dispatcher
 from threadpoolctl import threadpool_limits
 from typer.testing import CliRunner, Result
 
-from flowrec.core.system.numba_setup import _cache_folder, kernels_cached
-from flowrec.stages import Config, load_config
-from flowrec.verbs import main, mission_run
-from flowrec.verbs.admission import rehearse_aloud
+from flowrec.core.system.numba_setup import _cache_folder
+from flowrec.stages import load_config
+from flowrec.verbs import main
 from flowrec.verbs.cli import app
-from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.record import record
 from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
@@ -128,17 +126,6 @@ def _compile_in_turn(kernel: Any, signature: Any) -> Any:
 
 
 Dispatcher.compile = _compile_in_turn
-
-
-def _rehearse_in_turn(config: Config, control: Unattended) -> None:
-    """Rehearse unless another worker does: then that one has compiled the kernels of this run, too."""
-    cold = not kernels_cached()
-    with alone(Path(_cache_folder()) / "rehearsal.lock") if cold and _cache_folder() else nullcontext():
-        if config.recording.admission_s > 0.0 or not kernels_cached():
-            rehearse_aloud(config, control)
-
-
-mission_run.rehearse_aloud = _rehearse_in_turn
 
 
 @pytest.fixture(scope="session")

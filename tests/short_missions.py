@@ -1,12 +1,10 @@
 """Settings of short missions: without what conftest loads, for processes that tests start."""
 
-# A short survey, neither a check of the axes nor a trace of the walls before it, and no doubt about the depth of the
-# chip, which makes a refinement three times as long: most tests are about something else. The recorded sessions in
-# `sessions/` have the latter.
+# A short survey, no check of the axes before it, and no doubt about the depth of the chip, which makes a refinement
+# three times as long: most tests are about something else. The recorded sessions in `sessions/` have the latter.
 SMALL = [
     "camera.width_px=320",
     "camera.height_px=256",
-    "camera.trace_walls=false",
     "simulated.seed=1",
     "simulated.world=kind",
     "survey.method=downstream",

@@ -149,7 +149,7 @@ class Robot(RobotSettings):
         return replace(self, max_speed_um_s=slower * self.max_speed_um_s, um_per_rev=(1.0 + change) * self.um_per_rev)
 
     def um_per_rev_at(self, drag: float, refined: FlowField) -> float | None:
-        """What a refinement found of the um per revolution of this robot where side walls have a drag on it.
+        """The um per revolution of this robot where side walls have a drag on it, by what a refinement found.
 
         `drag` is over Stokes' drag, that of `SphereBetweenWalls`. None: no effect of the walls is significant, or it is
         none of drag, which slows a sphere that is pulled through open fluid by 1 per unit, and one over a floor less.

@@ -80,8 +80,9 @@ def _register() -> None:
     from numba.extending import typeof_impl
 
     # pymmcore_plus sets the level of the root logger to DEBUG. Then the messages of numba's passes take a third of a
-    # compilation.
-    logging.getLogger("numba").setLevel(logging.WARNING)
+    # compilation. A level that somebody chose for numba stays.
+    if logging.getLogger("numba").level == logging.NOTSET:
+        logging.getLogger("numba").setLevel(logging.WARNING)
 
     @typeof_impl.register(Kernel)
     def _(kernel: Kernel, context: Any) -> Any:
