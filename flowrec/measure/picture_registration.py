@@ -100,7 +100,7 @@ def register(
             break
         fits.append(fitter.fit(pose.calibration))
     # Of fits that end at one pose, one in which both readings do goes before one in which a reading went astray.
-    fits.sort(key=lambda fit: bool(_loose(fit).any()))
+    fits.sort(key=is_loose)
     distinct: list[WallFit] = []
     for fit in fits:
         if all(apart_px(fit.calibration, other.calibration, scene.walls.points_um) > _SAME_PX for other in distinct):
@@ -144,7 +144,7 @@ def moved_px(fit: WallFit, chip: Chip, assumed: Calibration) -> float | None:
     None if the picture does not tell, because it does not show enough of them.
     """
     walls = WallMap(chip.mask, chip.um_per_px)
-    return None if _loose(fit).any() else apart_px(fit.calibration, assumed, walls.points_um)
+    return None if is_loose(fit) else apart_px(fit.calibration, assumed, walls.points_um)
 
 
 def other_scale(fit: WallFit, assumed: Calibration) -> float | None:
@@ -158,6 +158,11 @@ def apart_px(one: Calibration, other: Calibration, points_um: Floats) -> float:
     """Root mean square distance of points (n, 2) on the walls of two poses in the image."""
     off = one.to_px(points_um) - other.to_px(points_um)
     return float(np.sqrt(np.mean(np.sum(off * off, -1))))
+
+
+def is_loose(fit: WallFit) -> bool:
+    """True where the picture does not determine shift, angle and scale of a fit."""
+    return bool(_loose(fit).any())
 
 
 def _loose(fit: WallFit) -> Mask:

@@ -24,7 +24,7 @@ import scipy  # its ndimage and spatial load at first use, not at start-up
 
 from flowrec.core import STD_PER_MAD, Bools, ChipError, Floats, Floats32, FlowError, Image, Ints
 from flowrec.measure.images import Levels, shrink
-from flowrec.measure.picture_registration import apart_px, fit_nearby, is_legible
+from flowrec.measure.picture_registration import apart_px, fit_nearby, is_legible, is_loose
 from flowrec.measure.wall_contours import ALONG_PX, WallContours
 from flowrec.measure.wall_fit import level_contrast
 from flowrec.measure.wall_search import move_chip
@@ -40,6 +40,8 @@ _LIKE = 0.5  # correlation from which a wall counts as seen
 # Profiles' b and c over their a from which on light comes from one side: 0.30 and 0.57 in relief, under 0.1 in eleven
 # other looks of walls.
 _SIDED = 0.2
+# The same of their extremes, whose place does not matter: over contrast 0.7 to 2.7 in relief, 0.23 at most in the others.
+_LIT = 0.45
 _FAINT = 0.3  # contrast of a profile, relative to the median, below which it shows no wall
 # Walls that differ by less (root mean square) are those of the mask: so far a right one is taken off. In pixels of the
 # mask or, where those are larger, of the camera; so is the next one.
@@ -51,7 +53,9 @@ _ROUNDS, _STILL_PX = 6, 0.05  # of profile, walls and pose; until the pose moves
 # Part of the walls in the picture, their length, and how far they may be off: walls that are found in blurred noise are
 # 82 to 85 % alike and 2.1 px off (root mean square), those of chips with walls up to a pixel off 97 % and 0.8 px.
 _LEAST_SEEN, _LEAST_WALL_PX, _MOST_WALL_PX = 0.9, 30, 1.5
-_UNKNOWN = 0.02  # motions that move walls by less, relative to the others, stay as stated: along a straight channel
+# Motions that move walls by less, relative to the others, stay as stated: along a straight channel, and the scale of
+# straight channels that meet at one place (0.01 to 0.05), which only their widths tell. Of other chips it is 0.33 or more.
+_UNKNOWN = 0.1
 # Points of a wall, and times the noise: a corner of a right mask is at most 1.1 px off over so many, an obstacle that
 # leaves half or two thirds of a channel 1.9 to 7 px.
 _STRETCH, _OBSTACLE = 7, 10.0
@@ -123,12 +127,13 @@ def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls 
     if not is_legible(picture, chip):
         return None
     contours = WallContours.of(chip)
-    found = _follow(picture, contours, stated, sided=False)
+    lit = _is_lit_from_one_side(picture, contours, stated)
+    found = None if lit else _follow(picture, contours, stated, sided=False)
     if found is None or found.sided > _SIDED:  # scale and place may be farther off than walls are sought
         nearby = fit_nearby(picture, chip, stated)
-        if nearby is None:
+        if nearby is None or is_loose(nearby):
             return None
-        found = _follow(picture, contours, nearby.calibration, sided=False)
+        found = None if lit else _follow(picture, contours, nearby.calibration, sided=False)
         if found is None or found.sided > _SIDED:
             found = _follow(picture, contours, nearby.calibration, sided=True)
     if found is None:
@@ -189,6 +194,25 @@ def _follow(picture: Image, contours: WallContours, start: Calibration, sided: b
     if abs(aside_px) > _ASIDE_PX * max(1.0, calibration.um_per_px / chip.um_per_px):
         out_px = np.where(contours.inside, out_px + aside_px, 0.0)
     return _Followed(calibration, out_px, like, share)
+
+
+def _is_lit_from_one_side(picture: Image, contours: WallContours, start: Calibration) -> bool:
+    """True where walls that face one way are bright and those that face the other way dark, as in relief.
+
+    The extremes of a profile do not tell where on it the wall is, so a chip that lies elsewhere makes no difference. In
+    profiles that are moved, relief looks like a chip that lies half a channel aside, and all its walls alike.
+    """
+    width_px = median_width_um(contours.chip) / contours.chip.um_per_px
+    image, step = _level_picture(picture, contours.chip, start, width_px)
+    reach = int(min(_OUT_PX, 0.5 * width_px) / _STEP_PX)  # the wall across the channel is not to be seen
+    profiles = _profiles(image, step, contours, start, np.arange(-reach, reach + 1), 0)
+    usable = contours.inside & np.isfinite(profiles).all(axis=1)
+    if np.count_nonzero(usable) < _LEAST_WALL_PX:
+        return False
+    high, low = profiles[usable].max(axis=1), profiles[usable].min(axis=1)
+    directions = np.column_stack([np.ones(len(high)), (start.axes @ contours.inward[usable].T).T])
+    common, *_ = np.linalg.lstsq(directions, high + low, rcond=_UNKNOWN)
+    return float(np.hypot(*common[1:])) > _LIT * max(float(np.median(high - low)), 1e-9)
 
 
 def _nearest_places(out_px: Floats, places: Ints) -> tuple[Ints, Ints]:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -149,6 +150,39 @@ def test_along_a_straight_channel_the_chip_stays_where_it_is_stated():
     assert abs(along_um) < 1.0
     assert across_um == pytest.approx(9.0, abs=1.0)
     assert found.um_per_px == pytest.approx(scene.stated.um_per_px, rel=2e-3)
+
+
+def drawn_chip(folder, curves, width_px):
+    """A chip of channels along curves (n, 2) in px of a mask of 240 x 160."""
+    mask = np.zeros((160, 240), np.uint8)
+    for curve, width in zip(curves, width_px, strict=True):
+        cv2.polylines(mask, [np.rint(16.0 * np.asarray(curve)).astype(np.int32)], False, 255, width, shift=4)
+    cv2.imwrite(str(folder / "drawn.png"), mask)
+    return load_chip(ChipSettings(path=str(folder / "drawn.png"), um_per_px=20.0))
+
+
+def test_the_scale_of_straight_channels_from_one_junction_stays_as_stated(tmp_path):
+    """Their walls lie alike in every scale; their widths alone tell it, and those of a mask are not exact."""
+    ends = ((-10.0, 20.0), (-10.0, 140.0), (250.0, 90.0))
+    chip = drawn_chip(tmp_path, [[(120.0, 80.0), end] for end in ends], (15, 10, 18))
+    scene = Scene(chip, "dark lines", 0.8)
+    found = trace_walls(scene.image, chip, scene.stated)
+    assert found.walls_differ
+    assert found.calibration.um_per_px == pytest.approx(scene.stated.um_per_px, rel=1e-2)
+    assert scene.off_um(found.calibration) < 0.5 * scene.off_um(scene.stated)
+
+
+@pytest.mark.parametrize(
+    ("waves", "width_px"), [(3, 6), pytest.param(3, 4, marks=LOOK), pytest.param(5, 8, marks=LOOK)]
+)
+def test_light_from_one_side_does_not_move_a_meander_by_half_its_channel(tmp_path, waves, width_px):
+    """Of relief, walls that face each other look alike half a channel aside of where they are."""
+    x = np.linspace(-5.0, 245.0, 400)
+    chip = drawn_chip(tmp_path, [np.column_stack((x, 80.0 + 66.0 * np.sin(2.0 * np.pi * waves * x / 240)))], [width_px])
+    for error_px in (0.0, 0.8):
+        scene = Scene(chip, "relief", error_px)
+        found = trace_walls(scene.image, chip, scene.stated)
+        assert found is None or scene.off_um(found.calibration) < 0.5 * scene.off_um(scene.stated)
 
 
 def another_picture(shown):
