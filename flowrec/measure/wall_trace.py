@@ -40,7 +40,7 @@ _LIKE = 0.5  # correlation from which a wall counts as seen
 # Profiles' b and c over their a from which on light comes from one side: 0.30 and 0.57 in relief, under 0.1 in eleven
 # other looks of walls.
 _SIDED = 0.2
-# The same of their extremes, whose place does not matter: over contrast 0.7 to 2.7 in relief, 0.23 at most in the others.
+# The same of their extremes, whose place does not matter, over contrast: 0.7 to 2.7 in relief, 0.23 at most in others.
 _LIT = 0.45
 _FAINT = 0.3  # contrast of a profile, relative to the median, below which it shows no wall
 # Walls that differ by less (root mean square) are those of the mask: so far a right one is taken off. In pixels of the
@@ -54,7 +54,7 @@ _ROUNDS, _STILL_PX = 6, 0.05  # of profile, walls and pose; until the pose moves
 # 82 to 85 % alike and 2.1 px off (root mean square), those of chips with walls up to a pixel off 97 % and 0.8 px.
 _LEAST_SEEN, _LEAST_WALL_PX, _MOST_WALL_PX = 0.9, 30, 1.5
 # Motions that move walls by less, relative to the others, stay as stated: along a straight channel, and the scale of
-# straight channels that meet at one place (0.01 to 0.05), which only their widths tell. Of other chips it is 0.33 or more.
+# straight channels that meet at one place (0.01 to 0.05), which only their widths tell. Of others it is 0.33 or more.
 _UNKNOWN = 0.1
 # Points of a wall, and times the noise: a corner of a right mask is at most 1.1 px off over so many, an obstacle that
 # leaves half or two thirds of a channel 1.9 to 7 px.
