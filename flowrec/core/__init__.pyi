@@ -110,7 +110,7 @@ from .system.table_file import DATES as DATES, TIME_UNITS as TIME_UNITS, Table a
 from .system.toml_file import parse_toml as parse_toml, read_toml as read_toml
 from .terminal import (
     Progress as Progress, console as console, looked_at as looked_at, outlet as outlet, progress as progress,
-    say as say, table as table, warn as warn, width as width,
+    say as say, table as table, shell_word as shell_word, warn as warn, width as width,
 )
 from .topics import (
     ANSWERED_BY as ANSWERED_BY, BY_FIELD as BY_FIELD, BY_PATH as BY_PATH, FLOW_FIELDS as FLOW_FIELDS,

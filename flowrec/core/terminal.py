@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TextIO, cast
 
 from rich.console import Console
@@ -28,6 +30,11 @@ console = Console(
     force_jupyter=False,
     force_terminal=False if "ipykernel" in sys.modules else None,
 )
+
+
+def shell_word(path: Path | str) -> str:
+    """A path in a command that a line suggests: as a shell takes it."""
+    return shlex.quote(str(path))
 
 
 def say(text: str) -> None:

@@ -17,7 +17,7 @@ import av.logging
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import MCAP, NS_PER_S, Image, Ints, MovieError, pixel_type
+from flowrec.core import MCAP, NS_PER_S, Image, Ints, MovieError, pixel_type, shell_word
 from flowrec.movies.grey import CHANNELS, refuse_colour
 from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, checked_size
 from flowrec.movies.notes import notes_in, refuse_drawn
@@ -240,7 +240,7 @@ def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
     except (av.FFmpegError, OSError) as error:
         remedy = "if it was cut short, ffmpeg may repair it"
         if path.suffix == MCAP[0]:
-            remedy = f"a session is replayed: flowrec replay {path} --refine"
+            remedy = f"a session is replayed: flowrec replay {shell_word(path)} --refine"
         raise MovieError(f"{path}: is no movie that can be read ({_text(error)}); {remedy}") from error
     with container:
         stream = container.streams.best("video")

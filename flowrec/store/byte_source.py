@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flowrec.core import Closing, SessionError, refuse_irregular
+from flowrec.core import Closing, SessionError, refuse_irregular, shell_word
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import MissingError
 
@@ -35,12 +35,16 @@ class LocalFile(Closing):
     def __init__(self, path: Path) -> None:
         self.path = path
         if path.is_dir():
-            raise SessionError(f"{path}: is a directory, not a session; name a .mcap file in it (`flowrec ls {path}`)")
+            raise SessionError(
+                f"{path}: is a directory, not a session; name a .mcap file in it (`flowrec ls {shell_word(path)}`)"
+            )
         try:
             refuse_irregular(path, SessionError)
             self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         except FileNotFoundError as error:
-            raise MissingError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
+            raise MissingError(
+                f"{path}: no such file; `flowrec ls {shell_word(path.parent)}` shows the sessions there"
+            ) from error
         except ValueError as error:  # a name with a NUL, which only another file can have given
             raise SessionError(f"{path}: is not the name of a file") from error
         except OSError as error:

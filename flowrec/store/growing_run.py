@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
-from flowrec.core import NS_PER_S, SessionError, Tick, is_growing
+from flowrec.core import NS_PER_S, SessionError, Tick, is_growing, shell_word
 from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_format import MAGIC
 from flowrec.store.mcap_reader import McapReader
@@ -102,7 +102,7 @@ class GrowingRun:
                 self._file = _GrowingFile(following)
             elif (partial := partial_path(self._file.path)).exists() and not is_growing(partial):
                 raise SessionError(
-                    f"{partial}: its recorder has ended without completing it; `flowrec recover {partial}` does"
+                    f"{partial}: its recorder has ended without completing it; `flowrec recover {shell_word(partial)}` does"
                 )
             else:
                 time.sleep(_POLL_S)

@@ -21,7 +21,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
 
-from flowrec.core import SessionError
+from flowrec.core import SessionError, shell_word
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -72,7 +72,7 @@ class DamageError(SessionError):
     """Bytes that can not be parsed; `what` says where and why, without advice."""
 
     def __init__(self, path: Path, what: str) -> None:
-        super().__init__(f"{path}: {what}; `flowrec recover {path}` recovers what is intact")
+        super().__init__(f"{path}: {what}; `flowrec recover {shell_word(path)}` recovers what is intact")
         self.what = what
 
 

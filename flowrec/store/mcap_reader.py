@@ -27,7 +27,7 @@ from mcap.records import (
     Schema,
 )
 
-from flowrec.core import MOVIE_FILES, Closing
+from flowrec.core import MOVIE_FILES, Closing, shell_word
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.lookup import GatheredCopies, Piece, complement, parse_lookup, place_of_lookup
 from flowrec.store.mcap_format import (
@@ -188,13 +188,13 @@ class McapReader(Closing):
         if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != FOOTER_BYTES + len(MAGIC):
             raise UnfinishedError(
                 f"{self.path}: was not finished (the run was killed, or the file is cut off);"
-                f" `flowrec recover {self.path}` makes a complete session of it"
+                f" `flowrec recover {shell_word(self.path)}` makes a complete session of it"
             )
         footer_at = self.size - len(tail)
         with self.parsing(footer_at):
             footer = Footer.read(stream_of(tail[9:]))
         if footer.summary_start == 0:
-            raise UnfinishedError(f"{self.path}: has no index; `flowrec recover {self.path}` makes one")
+            raise UnfinishedError(f"{self.path}: has no index; `flowrec recover {shell_word(self.path)}` makes one")
         return footer, footer_at, tail
 
     def _long_summary(self, footer: Footer, footer_at: int, tail: bytes) -> Summary:

@@ -33,7 +33,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from flowrec.core import Closing, SessionError, open_new
+from flowrec.core import Closing, SessionError, open_new, shell_word
 from flowrec.store.digest import channel_digest, digest_record, head_digest
 from flowrec.store.lookup import LOOKUP_OPCODE, SMALL_BYTES, Piece, lookup_record
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary, parse_summary
@@ -240,7 +240,11 @@ def disk_errors(path: Path, *, kept: bool = True) -> Iterator[None]:
             what, first = "the disk is full", "free some space"
         elif error.errno == errno.EFBIG:
             what, first = "no file may be larger here", "record in parts (recording.split_mb)"
-        then = f"then `flowrec recover {path}` saves what was recorded" if kept else "then try again; nothing is left"
+        then = (
+            f"then `flowrec recover {shell_word(path)}` saves what was recorded"
+            if kept
+            else "then try again; nothing is left"
+        )
         raise FileError(f"{path}: {what}; {first}, {then}") from error
 
 

@@ -32,6 +32,7 @@ from flowrec.core import (
     declaration,
     declared_topic,
     prioritise_thread,
+    shell_word,
 )
 from flowrec.store.parts import Parts
 from flowrec.store.ring_buffer import RingBuffer
@@ -174,7 +175,7 @@ class RecorderProcess:
             if not self._ended.is_set():
                 self.failure = SessionError(
                     f"{self.partial_path}: its recorder has ended ({error});"
-                    f" `flowrec recover {self.partial_path}` saves what it had written"
+                    f" `flowrec recover {shell_word(self.partial_path)}` saves what it had written"
                 )
         finally:
             self._ended.set()

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds
+from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds, shell_word
 from flowrec.store.byte_source import is_there, open_bytes
 from flowrec.store.mcap_format import UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata
@@ -142,7 +142,7 @@ def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ())
         if not is_partial(file):
             raise name_taken(file)
         raise SessionError(
-            f"{file}: is left from a run that did not finish; `flowrec recover {file}`"
+            f"{file}: is left from a run that did not finish; `flowrec recover {shell_word(file)}`"
             " saves it, another --out or --overwrite records without it"
         )
 
@@ -269,7 +269,7 @@ def _refuse_unfinished(path: Path, found: Sequence[Path], partial: Sequence[Path
         raise UnfinishedError(f"{path}: is being recorded just now; stop that run with Ctrl-C{others}")
     raise UnfinishedError(
         f"{path}: was not finished (the run was killed; {unfinished[-1].name} is left of it);"
-        f" `flowrec recover {path}` makes a complete session of it{others}"
+        f" `flowrec recover {shell_word(path)}` makes a complete session of it{others}"
     )
 
 
@@ -281,14 +281,14 @@ def check_continuity(path: Path, run: Sequence[RunFile]) -> None:
     for number, file in enumerate(run, 1):
         if (fault := continuity_fault(file, number, run[number - 2] if number > 1 else None)) is not None:
             raise SessionError(
-                f"{file.path}: {fault}; `flowrec check {path}` says more, a part that is named is read alone"
+                f"{file.path}: {fault}; `flowrec check {shell_word(path)}` says more, a part that is named is read alone"
             )
     last = run[-1]
     if is_continued(last.outcome):
         following = part_path(path, len(run) + 1)
         raise UnfinishedError(
             f"{following}: is missing, though {last.path.name} says that the run is continued in it; put it back,"
-            f" or let `flowrec recover {path}` end the run with what is there"
+            f" or let `flowrec recover {shell_word(path)}` end the run with what is there"
         )
 
 

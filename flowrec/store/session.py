@@ -23,6 +23,7 @@ from flowrec.core import (
     parse_toml,
     rows_for_people,
     seconds,
+    shell_word,
     verdict_lines,
 )
 from flowrec.store.notes import Note, append_note, read_notes
@@ -350,7 +351,7 @@ def input_blamed(session: Session, config: ResolvedConfig | None, done: str) -> 
         used = session.config if config is None else config
         number, fault = next(_absurd_numbers(session), None), next(faults(used), None)
         if number is not None:
-            reason, advice = number, f"`flowrec check {session.path}` says more"
+            reason, advice = number, f"`flowrec check {shell_word(session.path)}` says more"
         elif fault is not None:
             reason, advice = f"it was recorded with {fault}", f"replay it with --set {fault.key}=..."
         else:

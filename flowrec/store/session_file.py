@@ -14,7 +14,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowrec.core import FIXED, SessionError, TopicTable, __version__, name_taken, put_in_place, seconds, sync_directory
+from flowrec.core import (
+    FIXED,
+    SessionError,
+    TopicTable,
+    __version__,
+    name_taken,
+    put_in_place,
+    seconds,
+    shell_word,
+    sync_directory,
+)
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.file_end import end_file
@@ -332,7 +342,7 @@ class SessionFile:
     def encoding_failed(self, error: SessionError) -> FileError:
         """The error for a message that can not be stored."""
         self.failure = FileError(
-            f"{self.path}: {error}; `flowrec recover {self.partial_path}` recovers what was recorded before it"
+            f"{self.path}: {error}; `flowrec recover {shell_word(self.partial_path)}` recovers what was recorded before it"
         )
         return self.failure
 

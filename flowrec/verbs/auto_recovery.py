@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flowrec.core import PREFIX, BoundedProcess, FlowrecError, is_growing, remove_idle, say, try_lock, warn
+from flowrec.core import PREFIX, BoundedProcess, FlowrecError, is_growing, remove_idle, say, shell_word, try_lock, warn
 from flowrec.store import PARTIAL_SUFFIX, SESSION_SUFFIX, recover
 
 _UNFINISHED = SESSION_SUFFIX + PARTIAL_SUFFIX
@@ -68,10 +68,10 @@ def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> 
     for path in postponed[:_NAMED]:
         warn(
             f"{path} ({_size(path) / 1e6:.0f} MB) is left from a run that did not finish; "
-            f"flowrec recover {path} makes a session of it"
+            f"flowrec recover {shell_word(path)} makes a session of it"
         )
     if len(postponed) > _NAMED:
-        warn(f"{len(postponed) - _NAMED} more like it in {folder}; flowrec ls {folder} names them")
+        warn(f"{len(postponed) - _NAMED} more like it in {folder}; flowrec ls {shell_word(folder)} names them")
     return recovered
 
 

@@ -22,6 +22,7 @@ from flowrec.core import (
     irregular_frames,
     is_growing,
     seconds,
+    shell_word,
     skew_ppm,
 )
 from flowrec.physics import chip_from_files
@@ -139,7 +140,7 @@ class FileCheck:
                 verdict.bad("end", "it is being recorded just now; stop that run with Ctrl-C, then check again")
             else:
                 fault = found.why_not if found.why_not.startswith(("was ", "has ")) else f"is damaged: {found.why_not}"
-                verdict.bad("end", f"it {fault}; `flowrec recover {found.path}` recovers what is intact")
+                verdict.bad("end", f"it {fault}; `flowrec recover {shell_word(found.path)}` recovers what is intact")
         elif not how:
             verdict.odd("end", "how the run ended was not recorded")
         elif how == Outcome.FAILED:
@@ -159,11 +160,11 @@ class FileCheck:
         if found.lost:
             text = f"{found.lost} bytes are damaged, the first at {found.first_lost}"
             if found.finished:
-                verdict.bad("content", f"{text}; `flowrec recover {found.path}` recovers what is intact")
+                verdict.bad("content", f"{text}; `flowrec recover {shell_word(found.path)}` recovers what is intact")
             else:
                 verdict.odd("content", text)
         for text in found.contradictions:
-            verdict.bad("index", f"{text}; `flowrec recover {found.path}` makes a new index")
+            verdict.bad("index", f"{text}; `flowrec recover {shell_word(found.path)}` makes a new index")
         for text in found.disagreements:
             verdict.odd("index", text)
         self.undecodable(verdict)

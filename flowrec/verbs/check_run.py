@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.core import Coverage, Ended, Outcome, Role, seconds
+from flowrec.core import Coverage, Ended, Outcome, Role, seconds, shell_word
 from flowrec.store import UrlPath, continuity_fault, is_continued, part_number, part_path, size_of, verify_file
 from flowrec.verbs.check_file import EXACT, HEAD, NOT_EXACT, FileCheck
 from flowrec.verbs.verdict import CONSISTENT, DAMAGED, CheckFinding, Gap, Verdict
@@ -101,7 +101,10 @@ def _check_run(path: Path, checks: Sequence[FileCheck]) -> Verdict:
     _check_continuity(run, checks)
     if last.finished and is_continued(last.outcome):
         following = part_path(path, part_number(last.path) + 1).name
-        run.bad("end", f"the run continues in {following}, which is missing; `flowrec recover {path}` ends it there")
+        run.bad(
+            "end",
+            f"the run continues in {following}, which is missing; `flowrec recover {shell_word(path)}` ends it there",
+        )
     known = {name: topic.path for check in checks for name, topic in check.found.topics.by_field.items()}
     run.topics = {known[name]: count for name, count in counts.items() if count}
     ticks, size_bytes = sum(check.tally.ticks for check in checks), sum(check.found.size_bytes for check in checks)

@@ -5,6 +5,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
+from flowrec.core import shell_word
 from flowrec.verbs.command import MisuseError, verb
 from flowrec.verbs.options import Overwrite, SessionFile
 
@@ -31,7 +32,9 @@ class CutSession(NamedTuple):
     def lines(self) -> list[str]:
         """As text."""
         stretch = f"{self.ticks} ticks, {self.from_s:g} s to {self.to_s:g} s"
-        return [f"{self.path}: {stretch}; it replays from its first tick: flowrec replay {self.path} --verify"]
+        return [
+            f"{self.path}: {stretch}; it replays from its first tick: flowrec replay {shell_word(self.path)} --verify"
+        ]
 
 
 @verb("flowrec cut a.mcap --from 12 --to 30 -o b.mcap")

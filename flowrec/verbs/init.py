@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from flowrec.core import shell_word
 from flowrec.verbs.command import verb
 from flowrec.verbs.options import OF_FOLDER, Overwrite, Sets
 
@@ -49,7 +50,7 @@ class StartedConfig(NamedTuple):
 
     def lines(self) -> list[str]:
         """The files that were made, and the next command."""
-        chip, file = self.chip, "" if self.path == OF_FOLDER else f" {self.path}"
+        chip, file = self.chip, "" if self.path == OF_FOLDER else f" {shell_word(self.path)}"
         told = f"{self.path} written"
         if chip is not None and chip.suffix == ".png":
             told += f", without a chip: {chip} says that all of the image is fluid"
@@ -63,9 +64,13 @@ class StartedConfig(NamedTuple):
             ]
         if self.still and chip is not None and chip.suffix != ".png":
             return [told, f"next: flowrec record{file}  (a simulated mission on this chip)"]
-        log = f" --coils {self.coils or 'LOG.csv'}" if self.coils or chip is None or chip.suffix != ".png" else ""
+        coils = f" --coils {shell_word(self.coils or 'LOG.csv')}"
+        log = coils if self.coils or chip is None or chip.suffix != ".png" else ""
         log += "" if self.timed else " --fps F"
-        return [told, f"next: flowrec import {self.source}{file}{log} -o {self.source.stem}.mcap"]
+        return [
+            told,
+            f"next: flowrec import {shell_word(self.source)}{file}{log} -o {shell_word(self.source.stem + '.mcap')}",
+        ]
 
 
 class _Subject(NamedTuple):

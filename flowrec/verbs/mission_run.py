@@ -29,6 +29,7 @@ from flowrec.core import (
     kernels_cached,
     realtime_priority,
     say,
+    shell_word,
     warn,
 )
 from flowrec.measure import as_pictured
@@ -390,7 +391,7 @@ def _close_in_thread(opened: list[SessionWriter], reason: str) -> str:
     thread.start()
     thread.join(_GIVE_UP_TIMEOUT_S)
     if writer.partial_path.exists():
-        return f"flowrec recover {writer.partial_path} makes a session of what was recorded"
+        return f"flowrec recover {shell_word(writer.partial_path)} makes a session of what was recorded"
     return f"the file is whole: {files_text(writer.path, tuple(writer.files))}"
 
 

@@ -27,6 +27,7 @@ from flowrec.core import (
     name_of,
     progress,
     say,
+    shell_word,
     text_of_figure,
     verdict_lines,
     with_micro,
@@ -145,7 +146,7 @@ def _check_parents(session: Session, replays: Sequence[Session]) -> None:
             what = f"is a replay of {parent.get('file', '?')}, another recording" if parent else "is no replay"
             raise UsageError(
                 f"{replay.path}: {what}; name replays of {session.path}, which "
-                f"`flowrec replay {session.path} --refine` makes, or compare any two with flowrec compare"
+                f"`flowrec replay {shell_word(session.path)} --refine` makes, or compare any two with flowrec compare"
             )
 
 

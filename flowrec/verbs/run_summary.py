@@ -18,6 +18,7 @@ from flowrec.core import (
     name_of,
     robot_lines,
     say,
+    shell_word,
     text_of_figure,
     warn,
     way_text,
@@ -116,8 +117,9 @@ class Recorded:
             warn(f"doubtful: {doubt}")
         if sessions:
             refined = self.facts.get("refined_method") not in (None, "fvm") and "not_refined" not in self.facts
-            first = f"replay {sessions[0]} --refine" if refined else f"export {sessions[0]} tables --format csv"
-            verbs = [first, f"view {sessions[0]}"] if report.outcome in GOOD_ENDS else [f"view {sessions[0]}"]
+            session = shell_word(sessions[0])
+            first = f"replay {session} --refine" if refined else f"export {session} tables --format csv"
+            verbs = [first, f"view {session}"] if report.outcome in GOOD_ENDS else [f"view {session}"]
             say(f"next: {'    '.join(f'flowrec {each}' for each in verbs)}")
 
 

@@ -3,6 +3,7 @@
 import errno
 import os
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -48,6 +49,14 @@ def names_in(directory):
 def one_line(error):
     assert "\n" not in str(error.value), error.value
     return str(error.value)
+
+
+def test_a_command_that_an_error_suggests_works_for_a_name_with_blanks_and_quotes(session, tmp_path):
+    cut = tmp_path / "it's cut off.mcap"
+    cut.write_bytes(session.read_bytes()[:-500])
+    with pytest.raises(SessionError, match="flowrec recover") as error:
+        SessionReader(cut)
+    assert shlex.split(one_line(error).split("`")[1]) == ["flowrec", "recover", str(cut)]
 
 
 def test_an_existing_session_is_refused_before_anything_is_made(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +185,13 @@ def test_one_image_with_a_channel_leads_to_a_simulated_mission_and_a_movie_to_it
     movie = StartedConfig(Path("a.png"), Path("flowrec.toml"), Path("a_chip.toml"), None, True, Path("a.png"), False)
     assert movie.lines()[1].startswith("next: flowrec import a.png")
     assert movie._replace(still=True).lines()[1].startswith("next: flowrec record ")
+
+
+def test_the_next_command_works_for_a_movie_whose_name_has_blanks() -> None:
+    movie, log = Path("day 1/robot (2).mp4"), Path("coils 2.csv")
+    done = StartedConfig(movie, Path("my lab.toml"), Path("a.toml"), log, True, movie, False)
+    suggested = shlex.split(done.lines()[1].removeprefix("next: "))
+    assert suggested == ["flowrec", "import", str(movie), "my lab.toml", "--coils", str(log), "-o", "robot (2).mcap"]
 
 
 def test_a_lab_without_a_camera_is_told_what_to_do_once_and_no_driver_speaks_for_itself(

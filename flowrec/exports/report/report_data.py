@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Floats, FlowField, Image, Observations, SessionError
+from flowrec.core import Floats, FlowField, Image, Observations, SessionError, shell_word
 from flowrec.exports.formats import TimeProgress
 from flowrec.exports.report.history import History
 from flowrec.stages import tells_flow
@@ -53,7 +53,7 @@ class ReportData:
                 found, wanted = (" x ".join(map(str, size)) for size in sizes)
                 raise SessionError(
                     f"{session.path}: the {name} flow has {found} pixels, and the mask of the chip {wanted}; the file "
-                    f"was edited or damaged, see flowrec check {session.path}"
+                    f"was edited or damaged, see flowrec check {shell_word(session.path)}"
                 )
         return data
 
