@@ -102,7 +102,8 @@ class GrowingRun:
                 self._file = _GrowingFile(following)
             elif (partial := partial_path(self._file.path)).exists() and not is_growing(partial):
                 raise SessionError(
-                    f"{partial}: its recorder has ended without completing it; `flowrec recover {shell_word(partial)}` does"
+                    f"{partial}: its recorder has ended without completing it; "
+                    f"`flowrec recover {shell_word(partial)}` does"
                 )
             else:
                 time.sleep(_POLL_S)

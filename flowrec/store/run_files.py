@@ -281,7 +281,8 @@ def check_continuity(path: Path, run: Sequence[RunFile]) -> None:
     for number, file in enumerate(run, 1):
         if (fault := continuity_fault(file, number, run[number - 2] if number > 1 else None)) is not None:
             raise SessionError(
-                f"{file.path}: {fault}; `flowrec check {shell_word(path)}` says more, a part that is named is read alone"
+                f"{file.path}: {fault}; "
+                f"`flowrec check {shell_word(path)}` says more, a part that is named is read alone"
             )
     last = run[-1]
     if is_continued(last.outcome):

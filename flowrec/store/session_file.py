@@ -342,7 +342,8 @@ class SessionFile:
     def encoding_failed(self, error: SessionError) -> FileError:
         """The error for a message that can not be stored."""
         self.failure = FileError(
-            f"{self.path}: {error}; `flowrec recover {shell_word(self.partial_path)}` recovers what was recorded before it"
+            f"{self.path}: {error}; "
+            f"`flowrec recover {shell_word(self.partial_path)}` recovers what was recorded before it"
         )
         return self.failure
 
