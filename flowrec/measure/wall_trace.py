@@ -53,8 +53,8 @@ _ROUNDS, _STILL_PX = 6, 0.05  # of profile, walls and pose; until the pose moves
 # Part of the walls in the picture, their length, and how far they may be off: walls that are found in blurred noise are
 # 82 to 85 % alike and 2.1 px off (root mean square), those of chips with walls up to a pixel off 97 % and 0.8 px.
 _LEAST_SEEN, _LEAST_WALL_PX, _MOST_WALL_PX = 0.9, 30, 1.5
-# Motions that move walls by less, relative to the others, stay as stated: along a straight channel, and the scale of
-# straight channels that meet at one place (0.01 to 0.05), which only their widths tell. Of others it is 0.33 or more.
+# Where a motion moves walls by less, relative to the others, the scale is as stated: of straight channels that meet at
+# one place (0.01 to 0.05) only the widths tell it. What then is such a motion stays, too: along a straight channel.
 _UNKNOWN = 0.1
 # Points of a wall, and times the noise: a corner of a right mask is at most 1.1 px off over so many, an obstacle that
 # leaves half or two thirds of a channel 1.9 to 7 px.
@@ -333,15 +333,17 @@ def _move_pose(
     arm = points - points.mean(axis=0)
     reach = max(float(np.hypot(*arm.T).mean()), 1.0)
     turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
-    # The last unknown moves all walls outwards alike. Where on its profile a wall is, no picture tells: the mask does.
-    design = -np.column_stack(
-        [inward, (turned * inward).sum(axis=1) / reach, (arm * inward).sum(axis=1) / reach, -np.ones(len(points))]
-    )
+    design = -np.column_stack([inward, (turned * inward).sum(axis=1) / reach, (arm * inward).sum(axis=1) / reach])
+    told = np.linalg.svd(design[seen] - design[seen].mean(axis=0), compute_uv=False)
+    if told[-1] < _UNKNOWN * told[0]:
+        design[:, 3] = 0.0  # the scale is as stated
     weight = seen.astype(np.float64)
     for _ in range(10):  # Cauchy's weights: a blocked branch is no motion of the chip
         root = np.sqrt(weight)[:, None]
-        move, *_ = np.linalg.lstsq(root * design, root[:, 0] * out_px, rcond=_UNKNOWN)
-        left = out_px - design @ move
+        # A mean motion outwards is none of the chip: where on its profile a wall is, no picture tells, the mask does.
+        about, mean_px = np.average(design, axis=0, weights=weight), np.average(out_px, weights=weight)
+        move, *_ = np.linalg.lstsq(root * (design - about), root[:, 0] * (out_px - mean_px), rcond=_UNKNOWN)
+        left = out_px - mean_px - (design - about) @ move
         scale = STD_PER_MAD * float(np.median(np.abs(left[seen]))) + 1e-6
         weight = seen / (1.0 + (left / (2.0 * scale)) ** 2)
     px = contours.chip.um_per_px
@@ -350,4 +352,4 @@ def _move_pose(
     shift_px = calibration.vectors_to_px(px * move[:2])
     turn = -move[2] if calibration.mirror else move[2]
     moved = move_chip(calibration, np.array([*shift_px, per * turn, per * move[3]]), middle_px, per * reach)
-    return moved, left, float(np.abs(move[:4]).max())
+    return moved, left, float(np.abs(move).max())
