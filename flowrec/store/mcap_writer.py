@@ -254,4 +254,6 @@ def not_writable(path: Path, error: OSError) -> FileError:
         return FileError(f"{path.parent}: no such directory; make it, or choose another place with --out")
     if isinstance(error, BlockingIOError):
         return FileError(f"{path}: is being written by another process just now; choose another name with --out")
+    if isinstance(error, FileExistsError):  # since its name was looked at
+        return FileError(f"{path}: was made by another process meanwhile; choose another name with --out")
     return FileError(f"{path}: can not be made ({error.strerror}); choose another place with --out")

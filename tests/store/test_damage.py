@@ -26,7 +26,7 @@ from mcap.writer import Writer
 
 from flowrec.core import Currents, SessionError
 from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, merged_chunks, session_metadata
-from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.mcap_writer import McapWriter, new_mcap
 from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
 
@@ -57,6 +57,14 @@ def test_a_command_that_an_error_suggests_works_for_a_name_with_blanks_and_quote
     with pytest.raises(SessionError, match="flowrec recover") as error:
         SessionReader(cut)
     assert shlex.split(one_line(error).split("`")[1]) == ["flowrec", "recover", str(cut)]
+
+
+def test_the_second_of_two_runs_that_begin_one_file_together_is_told_of_the_other(tmp_path):
+    path = tmp_path / "s.mcap.partial"
+    new_mcap(path, overwrite=False).close()
+    with pytest.raises(SessionError, match="another process meanwhile; choose another name") as error:
+        new_mcap(path, overwrite=False)
+    assert one_line(error).startswith(str(path))
 
 
 def test_an_existing_session_is_refused_before_anything_is_made(tmp_path):
