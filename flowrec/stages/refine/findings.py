@@ -168,9 +168,11 @@ def _values(one: HypothesisFit) -> dict[str, tuple[float, float]]:
         "sphere_share": ("sphere", 1.0),
     }
     result: dict[str, tuple[float, float]] = dict(one.law)
+    rolled = one.observed.operator.rolled_um_s
+    of_fields = () if rolled is None or rolled.any() else ("gain", "hindrance", "heading")  # nothing is said of them
     for name, (effect, factor) in singles.items():
         mean, covariance = one.unknowns(effect)
-        if len(mean):
+        if len(mean) and effect not in of_fields:
             result[name] = (factor * float(mean[0]), factor * float(np.sqrt(covariance[0, 0])))
     result |= _rolling_by_drag(one)
     mean, covariance = one.unknowns("offset")
@@ -201,7 +203,7 @@ def _rolling_by_drag(one: HypothesisFit) -> dict[str, tuple[float, float]]:
     The drag is over Stokes' drag, `SphereBetweenWalls.drag`. Nothing where the robot's radius is not stated.
     """
     mean, covariance = one.unknowns("gain", "hindrance")
-    if one.observed.sphere is None or not len(mean):
+    if one.observed.sphere is None or not len(mean) or not np.any(one.observed.operator.rolled_um_s):
         return {}
     near, per_near = one.observed.near, 1.0 / float(one.observed.sphere.drag.max())
     line = np.array([[1.0, float(near.mean())], [0.0, -per_near]])

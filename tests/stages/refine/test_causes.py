@@ -237,6 +237,16 @@ def test_observations_without_motion_and_time_are_assimilated_as_those_of_older_
     assert case.error(refined) < 0.04
 
 
+def test_of_a_body_that_only_drifts_no_response_to_a_field_is_found_nor_missed(twin):
+    case = twin()
+    driven = replace(flown(case), radius_um=25.0)
+    drifts = replace(driven, rolled_um_s=np.zeros_like(driven.rolled_um_s))
+    refined, other = (SETTINGS.refine(case.assumed, each, case.chip, case.solver) for each in (drifts, driven))
+    for word in ("rev", "heading", "hindrance"):
+        assert word in other.parameter_names and word not in refined.parameter_names
+    assert "revolution" not in refined.note and "wander_share" in refined.parameter_names
+
+
 @pytest.mark.slow("refines several surveys")
 def test_the_expected_error_is_as_large_as_the_error_over_several_surveys(twin):
     case = twin()
