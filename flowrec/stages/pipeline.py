@@ -80,7 +80,7 @@ class Pipeline:
     robot: Robot  # in proportion to the frequency, see physics.Robot
     response: Robot  # as the coils drive it
     clearance_um: Floats32  # (h, w) from each pixel centre to the nearest wall, negative in solid
-    widths: ChannelWidths
+    widths: ChannelWidths  # of the channels, for the drag of both side walls
     image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
     image_bits: int  # depth of their pixels
     stabiliser: Stabiliser
