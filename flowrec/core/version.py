@@ -4,6 +4,8 @@ A session without a version of the numerics is of version 1, the first release.
 """
 
 __version__ = "0.1.0"
+# 7: a refined flow states the um per revolution as a line over the drag of the side walls.
+# 6: what a robot misses near its step-out frequency is a cause of its own.
 # 5: error bars are at least as wide as what no cause explains; `gain` states no spread where nothing flows.
 # 4: all walls may be off by the same distance.
 # 3: the assimilation knows the robot, the depth, the pump and a structural error as unknowns.

@@ -127,15 +127,17 @@ def trace_walls(picture: Image, chip: Chip, stated: Calibration) -> TracedWalls 
     if not is_legible(picture, chip):
         return None
     contours = WallContours.of(chip)
-    lit = _is_lit_from_one_side(picture, contours, stated)
-    found = None if lit else _follow(picture, contours, stated, sided=False)
+    levels = _level_picture(picture, contours, stated)
+    lit = _is_lit_from_one_side(levels, contours, stated)
+    found = None if lit else _follow(levels, contours, stated, sided=False)
     if found is None or found.sided > _SIDED:  # scale and place may be farther off than walls are sought
         nearby = fit_nearby(picture, chip, stated)
         if nearby is None or is_loose(nearby):
             return None
-        found = None if lit else _follow(picture, contours, nearby.calibration, sided=False)
-        if found is None or found.sided > _SIDED:
-            found = _follow(picture, contours, nearby.calibration, sided=True)
+        levels = _level_picture(picture, contours, nearby.calibration)
+        for sided in (True,) if lit else (False, True):
+            if found is None or found.sided > _SIDED:
+                found = _follow(levels, contours, nearby.calibration, sided)
     if found is None:
         return None
     calibration, out_px, like, _ = found
@@ -160,11 +162,10 @@ class _Followed(NamedTuple):
     sided: float  # size of the profiles' b and c over that of a
 
 
-def _follow(picture: Image, contours: WallContours, start: Calibration, sided: bool) -> _Followed | None:
+def _follow(levels: tuple[Levels, int], contours: WallContours, start: Calibration, sided: bool) -> _Followed | None:
     """Walls and pose near a first one, in light from one side or not; None if too few of the walls look alike."""
-    chip = contours.chip
+    chip, (image, step) = contours.chip, levels
     width_px = median_width_um(chip) / chip.um_per_px
-    image, step = _level_picture(picture, chip, start, width_px)
     calibration = start
     window = round(float(np.clip(_WINDOW_WIDTHS * width_px, *_WINDOW_PX)) / _STEP_PX)
     places = np.arange(-math.ceil(_IN_WIDTHS * width_px / _STEP_PX), math.ceil(_OUT_PX / _STEP_PX) + 1)
@@ -175,9 +176,8 @@ def _follow(picture: Image, contours: WallContours, start: Calibration, sided: b
         if np.count_nonzero(usable) < _LEAST_WALL_PX or not profiles[usable].std() > 0.0:
             return None
         at = _nearest_places(out_px, places)
-        towards = (calibration.axes @ contours.inward.T).T  # where the fluid lies, in the image
         at_walls = _windows(profiles, window)[at]
-        expected, share = _expect_profiles(at_walls, towards, usable, sided)
+        expected, share = _expect_profiles(at_walls, _directions(calibration, contours), usable, sided)
         likeness = _likeness(profiles, expected, usable)
         out_px = _move_walls(likeness, usable, places, contours)
         like = np.where(usable, likeness[_nearest_places(out_px, places)], np.nan)
@@ -196,21 +196,21 @@ def _follow(picture: Image, contours: WallContours, start: Calibration, sided: b
     return _Followed(calibration, out_px, like, share)
 
 
-def _is_lit_from_one_side(picture: Image, contours: WallContours, start: Calibration) -> bool:
+def _is_lit_from_one_side(levels: tuple[Levels, int], contours: WallContours, start: Calibration) -> bool:
     """True where walls that face one way are bright and those that face the other way dark, as in relief.
 
     The extremes of a profile do not tell where on it the wall is, so a chip that lies elsewhere makes no difference. In
     profiles that are moved, relief looks like a chip that lies half a channel aside, and all its walls alike.
     """
+    image, step = levels
     width_px = median_width_um(contours.chip) / contours.chip.um_per_px
-    image, step = _level_picture(picture, contours.chip, start, width_px)
     reach = int(min(_OUT_PX, 0.5 * width_px) / _STEP_PX)  # the wall across the channel is not to be seen
     profiles = _profiles(image, step, contours, start, np.arange(-reach, reach + 1), 0)
     usable = contours.inside & np.isfinite(profiles).all(axis=1)
     if np.count_nonzero(usable) < _LEAST_WALL_PX:
         return False
     high, low = profiles[usable].max(axis=1), profiles[usable].min(axis=1)
-    directions = np.column_stack([np.ones(len(high)), (start.axes @ contours.inward[usable].T).T])
+    directions = _directions(start, contours)[usable]
     common, *_ = np.linalg.lstsq(directions, high + low, rcond=_UNKNOWN)
     return float(np.hypot(*common[1:])) > _LIT * max(float(np.median(high - low)), 1e-9)
 
@@ -227,11 +227,13 @@ def _steep_place(expected: Floats32) -> float:
     return float((steep * places).sum() / max(float(steep.sum()), 1e-9))
 
 
-def _level_picture(picture: Image, chip: Chip, start: Calibration, width_px: float) -> tuple[Levels, int]:
+def _level_picture(picture: Image, contours: WallContours, start: Calibration) -> tuple[Levels, int]:
     """A picture without its slow variation, with pixels of at most half the mask's, and how many of its own they are.
 
-    Slow is what is wider than a channel, `width_px` of the mask.
+    Slow is what is wider than a channel.
     """
+    chip = contours.chip
+    width_px = median_width_um(chip) / chip.um_per_px
     step = max(int(0.5 * chip.um_per_px / start.um_per_px), 1)
     height, width = (n // step for n in picture.shape)
     small = shrink(np.asarray(picture[: step * height, : step * width], np.float32), (width, height))
@@ -258,17 +260,21 @@ def _windows(profiles: Floats32, window: int) -> Floats32:
     return np.lib.stride_tricks.sliding_window_view(profiles, 2 * window + 1, axis=1)
 
 
-def _expect_profiles(present: Floats32, towards: Floats, usable: Bools, sided: bool) -> tuple[Floats32, float]:
+def _directions(calibration: Calibration, contours: WallContours) -> Floats:
+    """(n, 3) 1, cos and sin of the direction in which the fluid lies at each wall, in the image: what a, b, c weigh."""
+    return np.column_stack([np.ones(len(contours.inward)), (calibration.axes @ contours.inward.T).T])
+
+
+def _expect_profiles(present: Floats32, directions: Floats, usable: Bools, sided: bool) -> tuple[Floats32, float]:
     """(n, m) the common profile at each wall, of mean 0, and the size of its b and c over that of its a.
 
     Parameters
     ----------
     present : (n, m) profiles where the walls are taken to be.
-    towards : (n, 2) unit vectors into the fluid, in the image.
+    directions : (n, 3) `_directions`.
     sided : b and c are part of the profile.
     """
     now = present - present.mean(axis=1, keepdims=True)
-    directions = np.column_stack([np.ones(len(towards)), towards])
     chosen = usable
     for _ in range(2):  # the second time without those that look different
         common, *_ = np.linalg.lstsq(directions[chosen], now[chosen], rcond=None)

@@ -174,7 +174,7 @@ def _place_on_chip(estimate: Estimate, refined: FlowField | None) -> Estimate:
 
 def _between_walls(p: Pipeline, last: Tick, refined: FlowField | None, known: Robot) -> Robot:
     """The known robot with the um per revolution that a refinement found for the place where it was a tick ago."""
-    if not p.refiner.correct_robot or refined is None or last.estimate is None:
+    if refined is None or last.estimate is None:
         return known
     point = _place_on_chip(last.estimate, refined).position_um / p.chip.um_per_px
     if not np.isfinite(point).all():
@@ -283,9 +283,10 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     lap("track")
     if p.refiner.correct_robot:
         known, seen = p.robot.learned_from(tick.refined), flow
+        here = _between_walls(p, last, tick.refined, known)
     else:
         known, seen = p.robot, None if flow is None else _without_registration(flow)
-    here = _between_walls(p, last, tick.refined, known)
+        here = known
     turn = known.course_turn(tick.refined) if p.refiner.correct_heading else None
     rolled = p.response.proportional_turns(last.applied, inputs.applied)
     applied = rolled if turn is None else replace(rolled, turns=turn @ rolled.turns)

@@ -16,7 +16,6 @@ from tests.short_missions import SMALL
 
 WALLS = (
     *SMALL,
-    "camera.trace_walls=true",
     "camera.um_per_px=20.0",
     "mission.phases=observe",
     "duration_s=1.0",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowrec.core import Floats, FlowField
-from flowrec.physics import ROLLING_BY_DRAG, Chip
+from flowrec.physics import ROLLING_BY_DRAG, Chip, SphereBetweenWalls
 from flowrec.stages.refine.causes import LINE_NAME, WALL_BIAS_NAME, WANDER_S
 from flowrec.stages.refine.disturbances import SHAKE
 from flowrec.stages.refine.hypothesis import HypothesisFit
@@ -158,23 +158,26 @@ def _bias_words(found: Sequence[HypothesisFit], weights: Floats) -> list[str]:
 def _values(one: HypothesisFit) -> dict[str, tuple[float, float]]:
     """Value and standard deviation by name, of one hypothesis."""
     px = one.observed.um_per_px
-    singles = {
+    rolled = one.observed.operator.rolled_um_s
+    response = {
         "um_per_rev_share": ("gain", 1.0),
         "hindrance_share": ("hindrance", 1.0),
         "heading_deg": ("heading", 180.0 / np.pi),
+    }
+    driven = rolled is not None and rolled.any()  # of a body that only drifts nothing is said of these
+    singles = (response if driven else {}) | {
         "um_per_px_share": ("scale", 1.0),
         "angle_deg": ("angle", 180.0 / np.pi),
         "carry_share": ("carry", 1.0),
         "sphere_share": ("sphere", 1.0),
     }
     result: dict[str, tuple[float, float]] = dict(one.law)
-    rolled = one.observed.operator.rolled_um_s
-    of_fields = () if rolled is None or rolled.any() else ("gain", "hindrance", "heading")  # nothing is said of them
     for name, (effect, factor) in singles.items():
         mean, covariance = one.unknowns(effect)
-        if len(mean) and effect not in of_fields:
+        if len(mean):
             result[name] = (factor * float(mean[0]), factor * float(np.sqrt(covariance[0, 0])))
-    result |= _rolling_by_drag(one)
+    if driven and one.observed.sphere is not None:
+        result |= _rolling_by_drag(one, one.observed.sphere)
     mean, covariance = one.unknowns("offset")
     for axis, index in (("x", 0), ("y", 1)):
         result[f"offset_{axis}_um"] = (px * float(mean[index]), px * float(np.sqrt(covariance[index, index])))
@@ -197,15 +200,10 @@ def _values(one: HypothesisFit) -> dict[str, tuple[float, float]]:
     return result
 
 
-def _rolling_by_drag(one: HypothesisFit) -> dict[str, tuple[float, float]]:
-    """The um per revolution over the stated one, less 1, as a line over the drag of the side walls: at 0, and per unit.
-
-    The drag is over Stokes' drag, `SphereBetweenWalls.drag`. Nothing where the robot's radius is not stated.
-    """
+def _rolling_by_drag(one: HypothesisFit, sphere: SphereBetweenWalls) -> dict[str, tuple[float, float]]:
+    """The um per revolution over the stated one, less 1, as a line over the sphere's drag: at 0, and per unit."""
     mean, covariance = one.unknowns("gain", "hindrance")
-    if one.observed.sphere is None or not len(mean) or not np.any(one.observed.operator.rolled_um_s):
-        return {}
-    near, per_near = one.observed.near, 1.0 / float(one.observed.sphere.drag.max())
+    near, per_near = one.observed.near, 1.0 / float(sphere.drag.max())
     line = np.array([[1.0, float(near.mean())], [0.0, -per_near]])
     stds = np.sqrt(np.diag(line @ covariance @ line.T))
     return dict(zip(ROLLING_BY_DRAG, zip((line @ mean).tolist(), stds.tolist(), strict=True), strict=True))
