@@ -98,9 +98,10 @@ def test_beside_walls_observer_and_coils_take_the_um_per_revolution_that_was_fou
             able.append(given[8].speed_limit_um_s)
             return pipeline.mission.update(*given)
 
-    def flown(by_drag, std=0.001, pipeline=pipeline):
+    def flown(by_drag, std=0.001, pipeline=pipeline, registration=None):
         names = ("um_per_rev_share", *ROLLING_BY_DRAG)
         found = replace(ticks[3].field, parameter_names="; ".join(names), parameters=np.array([0.0, 0.0, by_drag]))
+        found = replace(found, registration=registration)
         last = replace(ticks[3], refined=replace(found, parameter_std=np.array([0.1, 0.0, std])))
         return after(replace(pipeline, mission=Watched()), last, ticks[4:30])
 
@@ -127,6 +128,9 @@ def test_beside_walls_observer_and_coils_take_the_um_per_revolution_that_was_fou
         assert flown(no_drag).estimate.same_as(plain.estimate), "walls neither push a robot nor stop it"
     stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_robot=False))
     assert flown(-0.2, pipeline=stated).estimate.same_as(flown(0.0, pipeline=stated).estimate)
+    widest = np.unravel_index(pipeline.clearance_um.argmax(), pipeline.clearance_um.shape)[::-1]
+    there = flown(-0.2, registration=np.column_stack((1e-3 * np.eye(2), chip.um_per_px * np.array(widest))))
+    assert np.hypot(*there.estimate.rolled_um_s) > 1.02 * rolls, "a place is that on the chip, as it was found to lie"
 
 
 def test_the_course_that_a_refinement_found_turns_observer_and_coils_and_no_observation(navigation):
