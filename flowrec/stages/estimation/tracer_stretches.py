@@ -10,7 +10,8 @@ from flowrec.core import Floats, Observations, Tracers
 
 AtNominal = Callable[[Observations, Floats, Floats], Observations | None]
 
-CAPACITY = 2000  # the oldest are dropped first
+CAPACITY = 2000  # beyond it some tracers are left out, evenly over the run
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # multiples of it, less their whole parts, spread evenly (Weyl 1916)
 _LEAST_MOVED = 5.0  # standard deviations of the distance: what has not moved so far is stuck
 _SETTLED = 2.0  # images: a first stretch begins with the third, see vision/tracers.py
 _FLOOR_UM_S = 2.0  # least sigma of an observation
@@ -58,4 +59,13 @@ def collect_stretches(
     told = new if at_nominal is None else at_nominal(new, began_s[over], ended_s[over])
     if told is None or previous is None:
         return previous if told is None else told
-    return previous.followed_by(told).only(slice(-CAPACITY, None))
+    return _some_tracers(previous.followed_by(told))
+
+
+def _some_tracers(observations: Observations) -> Observations:
+    """CAPACITY of the observations: all of some tracers, which are the same at each call and began at all times."""
+    assert observations.tracer is not None
+    if len(observations.tracer) <= CAPACITY:
+        return observations
+    order = np.argsort(observations.tracer * _GOLDEN % 1.0, kind="stable")
+    return observations.only(np.sort(order[:CAPACITY]))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from flowrec.core import NS_PER_S, Tracers
-from flowrec.stages.estimation.tracer_stretches import collect_stretches
+from flowrec.stages.estimation.tracer_stretches import CAPACITY, collect_stretches
 
 
 def tracers(time_s: float, from_um: list, from_s: list, position_um: list, age: float = 20.0) -> Tracers:
@@ -40,3 +43,19 @@ def test_what_sticks_or_is_new_tells_no_flow() -> None:
     moved = tracers(2.0, [[100.0, 0.0], [10.0, 0.0]], [2.0, 1.0], START)
     assert collect_stretches(None, new, moved) is None
     assert collect_stretches(None, before, moved) is not None
+
+
+def test_of_more_stretches_than_are_kept_all_of_some_tracers_stay_from_every_part_of_the_run() -> None:
+    kept = None
+    for number in range(400):  # one body after the other, each over ten stretches
+        for step in range(10):
+            time_s = 10.0 * number + step
+            before = tracers(time_s + 0.9, [[100.0 * step, 0.0], [10.0, 0.0]], [time_s, 0.0], START)
+            after = tracers(time_s + 1.0, [[100.0 * (step + 1), 0.0], [10.0, 0.0]], [time_s + 1.0, 0.0], START)
+            both = np.array([number, 1e6])
+            kept = collect_stretches(kept, replace(before, id=both), replace(after, id=both))
+    assert kept is not None and len(kept.time_s) == CAPACITY
+    assert (np.diff(kept.time_s) > 0.0).all(), "in the order of their times"
+    assert np.histogram(kept.time_s, 8, (0.0, 4000.0))[0] == pytest.approx(CAPACITY / 8, rel=0.1)
+    each = np.unique(kept.tracer, return_counts=True)[1]
+    assert np.count_nonzero(each == 10) >= len(each) - 1
