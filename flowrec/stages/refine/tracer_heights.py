@@ -5,10 +5,10 @@ c = 3/2 (1 - (2 z / h - 1)^2). At each moment beads are spread evenly over the d
 E c^3 = 54/35. A fast one passes more stretches of equal length (`tracer_stretches.py`) in the same time, so that over
 stretches c has the mean E c^2 / E c = 1.2 and the variance E c^3 / E c - 1.2^2 = 0.103. This holds however often a
 tracer was lost and found again, as long as stretches are chosen without regard to the length of ways: the longest are
-those of the heights that flow fastest. A tracer stays at its height, so one error belongs to all of its observations:
-Gaussian here, of the size that the observations show (`HEIGHT` of causes.py). In a channel that is not shallow the
-profile is flatter, and where no depth is stated it may be flat: the part of this scatter that tracers show around an
-assumed flow is used for the mean.
+those of the heights that flow fastest. A tracer stays near its height for some seconds, over which its observations
+share one error: Gaussian here, of the size that the observations show (`HEIGHT` of causes.py). In a channel that is not
+shallow the profile is flatter, and where no depth is stated it may be flat: the part of this scatter that tracers show
+around an assumed flow is used for the mean.
 """
 
 from __future__ import annotations

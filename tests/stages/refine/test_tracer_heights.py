@@ -10,7 +10,7 @@ import pytest
 from flowrec.core import Observations
 from flowrec.physics import ChipSettings, FlowSolver, load_chip, sample
 from flowrec.stages.refine import Assimilate, Refiner
-from flowrec.stages.refine.causes import Observed
+from flowrec.stages.refine.causes import HEIGHT_S, Observed
 from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.noise import MOST_OBSERVATIONS, groups
 from flowrec.stages.refine.observation_operator import observation_operator
@@ -133,15 +133,18 @@ def test_beads_tell_the_flow_of_a_duct_within_bars_that_their_heights_leave() ->
     assert 0.5 * SCATTER / np.sqrt(30) < np.mean(bars) < 2.5 * SCATTER / np.sqrt(30)
 
 
-def test_all_observations_of_a_bead_share_the_error_of_its_height_and_the_robot_has_none() -> None:
+def test_observations_of_a_bead_share_the_error_of_its_height_for_some_seconds_and_the_robot_has_none() -> None:
     beads = of_beads(2, 1).only(slice(0, 4))
     operator = observation_operator(
-        replace(beads, tracer=np.array([-1.0, -1.0, 5.0, 5.0])), DUCT.mask, DUCT.um_per_px, ASSUMED.wall_px
+        replace(beads, tracer=np.array([-1.0, -1.0, 5.0, 5.0]), time_s=np.array([0.0, 1.0, 2.0, 2.0 + HEIGHT_S])),
+        DUCT.mask,
+        DUCT.um_per_px,
+        ASSUMED.wall_px,
     )
     settings = Assimilate()
     model = flow_model(settings, settings.model, DUCT, SOLVER)
     effects = {each.name: each for each in Observed.of(model, operator).effects(model.base, None)}
     kernel = effects["height"].kernel[::2, ::2]  # along x, in which the duct lies
     assert not kernel[:2].any() and not kernel[:, :2].any()
-    assert kernel[2, 3] == pytest.approx(np.sqrt(kernel[2, 2] * kernel[3, 3])) and kernel[2, 3] > 0.0
+    assert kernel[2, 3] == pytest.approx(np.exp(-1.0) * np.sqrt(kernel[2, 2] * kernel[3, 3])) and kernel[2, 3] > 0.0
     assert not effects["carry"].columns[:, 4:].any(), "a bead is no sphere of the robot's size"
