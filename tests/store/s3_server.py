@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from threading import Thread
+from threading import Condition, Thread
 from typing import Any
 
 import pytest
@@ -37,6 +37,7 @@ class S3Server:
 
         self.fault: Fault = lambda *_: None
         self.requests: list[tuple[str, str]] = []
+        self._answering, self._changed = 0, Condition()
         app = DomainDispatcherApplication(create_backend_app)
 
         def wrapped(environ: dict[str, Any], start: Any) -> Any:
@@ -44,7 +45,14 @@ class S3Server:
             self.requests.append((environ["REQUEST_METHOD"], url))
             status = self.fault(environ["REQUEST_METHOD"], url)
             if status is None:
-                return app(environ, start)
+                with self._changed:
+                    self._answering += 1
+                try:
+                    return app(environ, start)
+                finally:
+                    with self._changed:
+                        self._answering -= 1
+                        self._changed.notify_all()
             environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
             body = _NO_UPLOAD if status == 404 else b""
             start(f"{status} No", [("Content-Length", str(len(body)))])
@@ -72,6 +80,8 @@ class S3Server:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+        with self._changed:  # what a client left behind is still being stored
+            assert self._changed.wait_for(lambda: not self._answering, 60.0)
 
 
 @contextmanager
