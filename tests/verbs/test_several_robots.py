@@ -152,6 +152,24 @@ def test_robots_of_a_movie_are_named_by_their_places(
         )
 
 
+@pytest.mark.parametrize(
+    ("to_second_px", "told"), [((0, 0), "name each once"), ((60, 0), "no disc of the robot's size")]
+)
+def test_points_of_the_settings_are_looked_at_as_those_of_the_command_line(
+    to_second_px: tuple[int, int], told: str, movie: tuple[Path, Path, list[list[float]]]
+) -> None:
+    file, log, (first, _, third) = movie
+    second = (first if to_second_px == (0, 0) else third) + np.array(to_second_px)
+    asked = asked_import(
+        file, load_config(None, [*IMPORTED, f"tracker.robots_px={[first, second.tolist()]}"]), coils=log
+    )
+    with pytest.raises(UsageError, match=rf"tracker.robots_px\[1\]: .*{told}"):
+        fit_import(asked, file.parent, [], align=False)
+    asked = asked_import(file, load_config(None, IMPORTED), coils=log)
+    with pytest.raises(UsageError, match=rf"--robot .*px: .*{told}"):
+        fit_import(asked, file.parent, [f"{x},{y}px" for x, y in (first, second)], align=False)
+
+
 def test_robots_of_a_movie_are_named_by_numbers_of_its_picture(movie: tuple[Path, Path, list[list[float]]]) -> None:
     file, log, places = movie
     from_the_top = sorted(places, key=lambda place: place[1])
