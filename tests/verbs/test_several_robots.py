@@ -17,6 +17,7 @@ from flowrec.stages import load_config, robot_topic
 from flowrec.stages.robot_topics import track_of
 from flowrec.verbs.align import asked_import, fit_import
 from flowrec.verbs.compare import compare
+from flowrec.verbs.preparation import prepare
 from tests.conftest import answered
 from tests.rewritten import leaves_of, rewrite
 from tests.short_missions import SMALL
@@ -150,6 +151,11 @@ def test_robots_of_a_movie_are_named_by_their_places(
         flowrec.import_movie(
             file, out, sets=IMPORTED, coils=log, robot=[places[0], f"{x},{y}px"], align=False, overwrite=True
         )
+
+
+def test_a_point_on_a_single_robot_is_refused_where_it_would_not_be_read() -> None:
+    with pytest.raises(UsageError, match=r"names one; .* tracker.click_px = \[39.5, 75\]"):
+        prepare(load_config(None, ["tracker.robots_px=[[39.5,75]]"]))
 
 
 @pytest.mark.parametrize(
