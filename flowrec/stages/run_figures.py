@@ -112,7 +112,7 @@ class TracerStatistics:
         if not self._images:
             return ""
         if not self._shown:
-            return "none was found; section tracker.tracer states their radius and look"
+            return "none was followed over three images; section tracker.tracer states their radius and look"
         return f"{self._shown / self._images:.1f} an image, {_count_text(self._observations, 'flow observation')}"
 
 

@@ -149,7 +149,7 @@ def test_an_image_without_bodies_has_no_tracks(count: int) -> None:
 
 
 def test_a_run_tells_how_many_tracers_it_followed_and_that_it_found_none() -> None:
-    for count, told in ((2, "2.0 an image, 3 flow observations"), (0, "none was found")):
+    for count, told in ((2, "2.0 an image, 3 flow observations"), (0, "none was followed")):
         statistics = RunStatistics()
         assert statistics.others == {}, "a run without tracers has no such line"
         ways = np.array([[40.0, 60.0], [90.0, 60.0]])[:count] + np.zeros((12, 1, 1))
