@@ -38,6 +38,7 @@ _ASSIMILATED = "assimilated "  # before the number of observations, at the begin
 _UM = re.compile(r"(?<![\w.])um\b")
 _ROBOT = re.compile(r"robot_\d{1,4}")  # keys of the figures of other robots, which are text
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
+TRACERS = "tracers"  # key of the figures of the tracers, which are text
 DOUBTS = "doubts"  # key of the outcome of a session: why its result is doubtful; absent: it is not
 # Names of keys that would be misread as words.
 _NAMES = {
@@ -107,9 +108,9 @@ def is_of_robot(key: str) -> bool:
     return _ROBOT.fullmatch(key) is not None
 
 
-def robot_lines(figures: Mapping[str, Value]) -> list[str]:
-    """A line for each robot other than the first one."""
-    return [f"{name_of(key)}: {value}" for key, value in figures.items() if is_of_robot(key)]
+def body_lines(figures: Mapping[str, Value]) -> list[str]:
+    """A line for each robot other than the first one, and one for the tracers."""
+    return [f"{name_of(key)}: {value}" for key, value in figures.items() if is_of_robot(key) or key == TRACERS]
 
 
 def text_of_figure(key: str, value: Value) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from flowrec.core import (
     FLOW_FIELDS,
+    TRACERS,
     WALLS,
     Demand,
     Figures,
@@ -31,6 +32,7 @@ from flowrec.stages.planning.planner import Planner
 from flowrec.stages.planning.survey_ways import METHOD as SURVEY_ROUTE
 from flowrec.stages.robot_topics import observations_topic, track_of
 
+_SETTLED = 2.0  # images: one that fewer have shown may be noise
 CHAIN = ("arrived", "tracked", "commanded", "on the wire", "field")  # stages of the latency, after the exposure
 
 
@@ -90,6 +92,30 @@ class RobotStatistics:
         return ", ".join(words)
 
 
+class TracerStatistics:
+    """Figures of the tracers, from all ticks."""
+
+    def __init__(self) -> None:
+        self._images = self._shown = self._observations = 0
+
+    def write(self, tick: Tick) -> None:
+        """Take one tick."""
+        if tick.tracers is not None and tick.tracers.stamp_ns == tick.stamp_ns:
+            self._images += 1
+            self._shown += int(((tick.tracers.age_frames > _SETTLED) & (tick.tracers.lost_frames == 0)).sum())
+        if tick.tracer_flow is not None:
+            self._observations = len(tick.tracer_flow.std_um_s)
+
+    @property
+    def text(self) -> str:
+        """In words: how many an image shows, observations; '' where they are not followed."""
+        if not self._images:
+            return ""
+        if not self._shown:
+            return "none was followed over three images; section tracker.tracer states their radius and look"
+        return f"{self._shown / self._images:.1f} an image, {_count_text(self._observations, 'flow observation')}"
+
+
 def _count_text(count: int, name: str) -> str:
     return f"{count} {name}{'' if count == 1 else 's'}"
 
@@ -113,6 +139,7 @@ class RunStatistics:
         self._count = 0
         self._last: Demand | None = None
         self._others: dict[int, RobotStatistics] = {}
+        self._tracers = TracerStatistics()
 
     def write(self, tick: Tick) -> None:
         """Take one tick."""
@@ -125,6 +152,7 @@ class RunStatistics:
         while (track := track_of(tick, number)) is not None:
             self._others.setdefault(number, RobotStatistics(number)).write(tick, track)
             number += 1
+        self._tracers.write(tick)
         demand = tick.demand
         if tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
             return
@@ -139,8 +167,9 @@ class RunStatistics:
 
     @property
     def others(self) -> Figures:
-        """A line of text for each robot other than the first one."""
-        return {f"robot_{number}": each.text for number, each in self._others.items()}
+        """A line of text for each robot other than the first one, and one for the tracers."""
+        lines: Figures = {f"robot_{number}": each.text for number, each in self._others.items()}
+        return lines | ({TRACERS: text} if (text := self._tracers.text) else {})
 
     @property
     def latency(self) -> str | None:

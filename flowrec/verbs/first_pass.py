@@ -52,6 +52,7 @@ from flowrec.stages import (
 from flowrec.verbs.preparation import Prepared, prepare
 
 _SHAKES_PX = 0.1  # root mean square from which on it is told; half a pixel is what a track is off at most
+_SAME_RADII = 0.25  # between two named places that are one body: robots that hide each other are farther apart
 _ON_IT_RADII = 1.5  # between a named place and the disc that is found for it
 _PX = "px"
 _SURROUNDINGS_RADII = 6.0  # of the robot as stated: half the side of the window in which its size is measured
@@ -111,7 +112,7 @@ def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: 
     several = len(named) > 1 or asks.count > 1
     place_px = None if several else _place_of(robot, asked, p)
     if several:
-        asked = _with_robots(asked, p, config, named) if named else asked
+        asked = _with_robots(asked, p, config, named) if named or asks.robots_px else asked
     elif place_px is not None:
         asked = replace(asked, tracker=replace(asked.tracker, click_px=place_px))
     elif not marked and (seen := _first_seen(p, config)) is not None:
@@ -132,24 +133,35 @@ def first_pass(asked: Config, looked_at: Config, robots: Sequence[str], folder: 
 
 
 def _with_robots(asked: Config, p: Pipeline, config: ResolvedConfig, robots: Sequence[str]) -> Config:
-    """The configuration with a point on each of several robots in the first image; UsageError where there is none."""
+    """The configuration with a point on each of several robots in the first image; UsageError where there is none.
+
+    `robots`: as of `first_pass`; none: those of tracker.robots_px.
+    """
     alone = replace(p, tracker=replace(p.tracker, robots=1, robots_px=()))
     with MovieSource(config.movie, config.coils) as source:
         image = next(iter(_within(source, config)))
-    candidates, _ = _candidates(p, image, look(alone, Sight(), image))
-    places_px = [_place_of(each, asked, p) or _place_of_number(each, candidates, image, asked) for each in robots]
+    names, places_px = [f"tracker.robots_px[{n}]" for n in range(len(asked.tracker.robots_px))], asked.tracker.robots_px
+    if robots:
+        candidates, _ = _candidates(p, image, look(alone, Sight(), image))
+        names = [f"--robot {each}" for each in robots]
+        places_px = tuple(
+            _place_of(each, asked, p) or _place_of_number(each, candidates, image, asked) for each in robots
+        )
     count = max(asked.tracker.robots, len(places_px))
-    found = replace(p, tracker=replace(p.tracker, robots=count, robots_px=tuple(places_px)))
+    found = replace(p, tracker=replace(p.tracker, robots=count, robots_px=places_px))
     sight = look(found, Sight(), image)
     radius_px = p.robot.radius_um / p.calibration.um_per_px
     assert sight.track is not None
-    for robot, at_px, track in zip(robots, places_px, (sight.track, *sight.others), strict=False):
+    for n, (name, at_px) in enumerate(zip(names, places_px, strict=True)):
+        if any(math.dist(at_px, other_px) < _SAME_RADII * radius_px for other_px in places_px[:n]):
+            raise UsageError(f"{name}: another robot is named at ({at_px[0]:.0f}, {at_px[1]:.0f}) px; name each once")
+    for name, at_px, track in zip(names, places_px, (sight.track, *sight.others), strict=False):
         if not track.seen or math.dist(p.calibration.to_px(track.position_um), at_px) > _ON_IT_RADII * radius_px:
             raise UsageError(
-                f"--robot {robot}: at ({at_px[0]:.0f}, {at_px[1]:.0f}) px of image {image.index} no disc of the "
+                f"{name}: at ({at_px[0]:.0f}, {at_px[1]:.0f}) px of image {image.index} no disc of the "
                 "robot's size and darkness is found; give the middle of a robot"
             )
-    return replace(asked, tracker=replace(asked.tracker, robots=count, robots_px=tuple(places_px)))
+    return replace(asked, tracker=replace(asked.tracker, robots=count, robots_px=places_px))
 
 
 def _place_of_number(robot: str, places_px: Floats, image: Frame, asked: Config) -> tuple[float, float]:

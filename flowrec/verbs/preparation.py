@@ -75,16 +75,11 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
 
     Raises
     ------
-    UsageError : the method of the sampler needs a recording.
+    UsageError : the method of the sampler needs a recording; tracker.robots_px names one robot alone.
     UnreachableError : see `refuse_adrift`.
     ChipError : the images of a movie show the chip in another orientation than stated, or at another scale.
     """
-    if "recording" in SAMPLERS[asked.sampler.method].needs:
-        able = " or ".join(f"'{row.name}'" for row in SAMPLERS.values() if "recording" not in row.needs)
-        raise UsageError(
-            f"sampler.method = {asked.sampler.method!r} needs the whole recording: use it in flowrec replay --refine; "
-            f"a run takes {able}"
-        )
+    _refuse_unfit(asked)
     tell, caution = (say, warn) if aloud else (_unsaid, _unsaid)
     given, facts = asked, dict[str, str]()
     if asked.rig == MOVIE:
@@ -136,6 +131,22 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
     return Prepared(config, chip, assemble(config, chip), made, facts, image, walls, picture)
+
+
+def _refuse_unfit(asked: Config) -> None:
+    """Raise UsageError for settings that are none of a run, as `prepare` tells."""
+    if "recording" in SAMPLERS[asked.sampler.method].needs:
+        able = " or ".join(f"'{row.name}'" for row in SAMPLERS.values() if "recording" not in row.needs)
+        raise UsageError(
+            f"sampler.method = {asked.sampler.method!r} needs the whole recording: use it in flowrec replay --refine; "
+            f"a run takes {able}"
+        )
+    if asked.tracker.count == 1 and asked.tracker.robots_px:  # nothing would read it
+        (x, y), *_ = asked.tracker.robots_px
+        raise UsageError(
+            f"tracker.robots_px is for several robots, and names one; for one robot give tracker.click_px = [{x:g}, "
+            f"{y:g}]"
+        )
 
 
 def _looked_at(

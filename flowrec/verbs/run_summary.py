@@ -12,11 +12,11 @@ from flowrec.core import (
     Figures,
     FlowField,
     Outcome,
+    body_lines,
     doubts_of,
     end_text,
     flow_text,
     name_of,
-    robot_lines,
     say,
     shell_word,
     text_of_figure,
@@ -98,7 +98,7 @@ class Recorded:
         facts = self.facts
         ended = f"{end_text(facts)}, computed in {text_of_figure('wall_s', facts['wall_s'])}"
         also = [f"{name_of(key)}: {text_of_figure(key, facts[key])}" for key in _ALSO if facts.get(key)]
-        also += robot_lines(facts)
+        also += body_lines(facts)
         won = ["; ".join(filter(None, (ended, way_text(facts)))), flow_text(facts)]
         return [*filter(None, won), *also, f"file: {files_text(self.path, self.files)}"]
 

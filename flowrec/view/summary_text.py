@@ -15,11 +15,11 @@ from flowrec.core import (
     Row,
     Tick,
     Value,
+    body_lines,
     comparison_for_people,
     doubts_text,
     flow_text,
     goal_text,
-    robot_lines,
     seconds,
     text_for_picture,
     verdict_lines,
@@ -91,7 +91,7 @@ def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.
     rows = comparison_for_people(row for row in rows_of_run(last, figures) if row[0] not in said)
     about = "; ".join([f"session {title}", *(f"{name} {value}" for name, value, _ in rows)])
     ended, *told = verdict_lines({"outcome": "its end is not known", **figures}, last.refined)
-    others = robot_lines(figures)
+    others = body_lines(figures)
     return _document(_sentences(filter(None, [ended, about, *told, *others, registration_remark(last.refined)])))
 
 

@@ -17,6 +17,7 @@ from flowrec.stages import load_config, robot_topic
 from flowrec.stages.robot_topics import track_of
 from flowrec.verbs.align import asked_import, fit_import
 from flowrec.verbs.compare import compare
+from flowrec.verbs.preparation import prepare
 from tests.conftest import answered
 from tests.rewritten import leaves_of, rewrite
 from tests.short_missions import SMALL
@@ -150,6 +151,29 @@ def test_robots_of_a_movie_are_named_by_their_places(
         flowrec.import_movie(
             file, out, sets=IMPORTED, coils=log, robot=[places[0], f"{x},{y}px"], align=False, overwrite=True
         )
+
+
+def test_a_point_on_a_single_robot_is_refused_where_it_would_not_be_read() -> None:
+    with pytest.raises(UsageError, match=r"names one; .* tracker.click_px = \[39.5, 75\]"):
+        prepare(load_config(None, ["tracker.robots_px=[[39.5,75]]"]))
+
+
+@pytest.mark.parametrize(
+    ("to_second_px", "told"), [((0, 0), "name each once"), ((60, 0), "no disc of the robot's size")]
+)
+def test_points_of_the_settings_are_looked_at_as_those_of_the_command_line(
+    to_second_px: tuple[int, int], told: str, movie: tuple[Path, Path, list[list[float]]]
+) -> None:
+    file, log, (first, _, third) = movie
+    second = (first if to_second_px == (0, 0) else third) + np.array(to_second_px)
+    asked = asked_import(
+        file, load_config(None, [*IMPORTED, f"tracker.robots_px={[first, second.tolist()]}"]), coils=log
+    )
+    with pytest.raises(UsageError, match=rf"tracker.robots_px\[1\]: .*{told}"):
+        fit_import(asked, file.parent, [], align=False)
+    asked = asked_import(file, load_config(None, IMPORTED), coils=log)
+    with pytest.raises(UsageError, match=rf"--robot .*px: .*{told}"):
+        fit_import(asked, file.parent, [f"{x},{y}px" for x, y in (first, second)], align=False)
 
 
 def test_robots_of_a_movie_are_named_by_numbers_of_its_picture(movie: tuple[Path, Path, list[list[float]]]) -> None:

@@ -78,7 +78,7 @@ class Shift(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracers(Message):
-    """Tracks of all bodies in view but the robot, a row each: the state of a constant-velocity filter.
+    """Tracks of all bodies in view but the robot, an element of each array a body: a constant-velocity filter's state.
 
     The covariance of position and velocity is the same along x and y.
     """

@@ -42,6 +42,7 @@ MEANINGS: dict[str, str] = {
     "unmet_mt": "of coils.amplitude_mt, what the limits of current and voltage of the coils did not permit",
     "contacts": "counted by the simulation",
     "robot": "a robot beside the mission's one; wall contacts are counted by the simulation",
+    "tracers": "bodies beside the robots that drift with the flow",
     "assumed_method": "how the flow was computed before the run",
     "assumed_flow_error": "root mean square difference from the simulated true flow, relative to that flow",
     "refined_method": "how the flow was corrected in the run",

@@ -62,7 +62,9 @@ class TracerTracker:
     # radius of the tracers; None: a quarter of the robot's
     radius_um: Annotated[float, Range(0.1, 1e4)] | None = None
     look: Literal["dark", "bright"] = "dark"  # brightness of the tracers relative to the background
-    least_snr: Annotated[float, Range(1.0, 1e3)] = 6.0  # contrast of a tracer over the noise of the filtered image
+    # contrast of a tracer over the noise of the filtered image, its median: bodies that cover a twentieth of the image
+    # raise that, and then 3 finds them
+    least_snr: Annotated[float, Range(1.0, 1e3)] = 6.0
     # largest ratio of the principal curvatures of a spot, which the edges of walls exceed; 0: any. It is 1.8 of a disc
     # that moves by its diameter while the image is exposed
     most_elongated: Annotated[float, Range(0.0, 1e3)] = 3.0

@@ -7,6 +7,9 @@ A track is doubtful where what was followed may not have been the robot all the 
 - rivals: another body of like brightness is as near to the expected place as the robot itself may be, so that the two
   may have been exchanged;
 - looks: at the end it looks or shines as it did not at the beginning.
+
+Of the other robots of a run, which come and go, jumps alone are told: their observations of the flow are those of
+another body from there on.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy as np
 
 from flowrec.core import Appearance, Floats, Shift, Tick, Track, seconds, shift_px
 from flowrec.physics import Calibration, Robot
+from flowrec.stages.robot_topics import track_of
 from flowrec.stages.vision.assignment import EXPECTED_FRAMES
 from flowrec.stages.vision.foreground import correlation
 from flowrec.stages.vision.learned import ReducedScale
@@ -56,10 +60,17 @@ class TrackQuality:
         self._energy: tuple[float, float] | None = None  # at the beginning and now
         self._count = self._cut = self._rivals = 0
         self._steps_s, self._steps_um, self._off_um, self._at_s = array("d"), array("d"), array("d"), array("d")
+        self._others: list[TrackQuality] = []  # of the other robots, in the order of their numbers
 
     def write(self, tick: Tick) -> None:
-        """Take one tick."""
+        """Take one tick, with the tracks of all robots."""
         self.take(tick.track, tick.appearance, tick.shift)
+        number = 1
+        while (track := track_of(tick, number)) is not None:
+            if number > len(self._others):
+                self._others.append(TrackQuality(self._calibration, self._image_shape, self._robot))
+            self._others[number - 1].take(track, None, tick.shift)
+            number += 1
 
     def take(self, track: Track | None, appearance: Appearance | None, shift: Shift | None) -> None:
         """Take the latest messages of these kinds; a track counts once."""
@@ -95,14 +106,7 @@ class TrackQuality:
 
     def doubts(self) -> list[str]:
         """Reasons why the track is doubtful, for people; empty if there are none."""
-        found = []
-        jumps_s = self._jumps_s()
-        if len(jumps_s):
-            where = ", ".join(f"{time_s:.2f}" for time_s in jumps_s[:3]) + (", ..." if len(jumps_s) > 3 else "")
-            found.append(
-                f"the track jumps {_times(len(jumps_s))} farther than the robot goes (at {where} s): to another body, "
-                "or images are missing there"
-            )
+        found = self.jumps()
         if self._cut:
             found.append(f"the robot is cut by the border of the image on {self._of(self._cut)}")
         if self._rivals:
@@ -110,7 +114,19 @@ class TrackQuality:
                 f"another body like the robot is as near as the robot itself on {self._of(self._rivals)}: the two may "
                 "have been exchanged"
             )
-        return found + self._looks()
+        found += self._looks()
+        return found + [f"robot {n}: {doubt}" for n, each in enumerate(self._others, 1) for doubt in each.jumps()]
+
+    def jumps(self) -> list[str]:
+        """The doubt that jumps of this track raise; empty if it has none."""
+        jumps_s = self._jumps_s()
+        if not jumps_s:
+            return []
+        where = ", ".join(f"{time_s:.2f}" for time_s in jumps_s[:3]) + (", ..." if len(jumps_s) > 3 else "")
+        return [
+            f"the track jumps {_times(len(jumps_s))} farther than the robot goes (at {where} s): to another body, or "
+            "images are missing there"
+        ]
 
     def _jumps_s(self) -> list[float]:
         """Times of the steps that are no motion of the robot."""

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from flowrec.core import Frame, Track
+from flowrec.core import Frame, Observations, Tick, Track
 from flowrec.physics import Calibration, Chip, Robot
+from flowrec.stages import RunStatistics
 from flowrec.stages.vision.tracers import _GATE, TracerTracker, assign
 
 UM = 10.0  # per pixel, of the camera and of the mask
@@ -145,3 +146,16 @@ def test_groups_are_assigned_as_all_bodies_at_once_would_be() -> None:
 @pytest.mark.parametrize("count", [0, 1])
 def test_an_image_without_bodies_has_no_tracks(count: int) -> None:
     assert followed(np.full((2, count, 2), np.nan))[-1].count == 0
+
+
+def test_a_run_tells_how_many_tracers_it_followed_and_that_it_found_none() -> None:
+    for count, told in ((2, "2.0 an image, 3 flow observations"), (0, "none was followed")):
+        statistics = RunStatistics()
+        assert statistics.others == {}, "a run without tracers has no such line"
+        ways = np.array([[40.0, 60.0], [90.0, 60.0]])[:count] + np.zeros((12, 1, 1))
+        seen = followed(ways)
+        flow = Observations(0, np.zeros((3, 2)), np.zeros((3, 2)), np.ones(3))
+        for each in seen[3:]:
+            statistics.write(Tick(each.stamp_ns, tracers=each, tracer_flow=flow if count else None))
+        statistics.write(Tick(seen[-1].stamp_ns + 1, tracers=seen[-1], tracer_flow=flow if count else None))
+        assert told in str(statistics.others["tracers"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import Appearance, Track
+from flowrec.core import Appearance, Extra, Tick, Track
 from flowrec.stages import TrackQuality
 from tests.stages.vision.shaky import CALIBRATION, HEIGHT, ROBOT, UM_PER_PX, WIDTH
 
@@ -51,6 +51,18 @@ def test_a_jump_to_another_body_is_doubted_and_its_time_told() -> None:
     ]
     (doubt,) = doubts(moved)
     assert "jumps once farther than the robot goes (at 1.00 s)" in doubt
+
+
+def test_a_jump_of_another_robot_is_told_with_its_number_and_its_border_is_not() -> None:
+    quality = TrackQuality(CALIBRATION, (HEIGHT, WIDTH), ROBOT)
+    for n, first in enumerate(tracks()):
+        at_um = UM_PER_PX * np.array([WIDTH - 2.0 if n < 30 else WIDTH - 60.0, 70.0])
+        other = replace(first, position_um=at_um + first.position_um - tracks()[0].position_um)
+        quality.write(
+            Tick(first.stamp_ns, track=first, extra=Extra({"/robot/1/track": first, "/robot/2/track": other}))
+        )
+    (doubt,) = quality.doubts()
+    assert doubt.startswith("robot 2: the track jumps once farther than the robot goes (at 1.00 s)")
 
 
 def test_jumps_on_half_of_the_images_do_not_pass_as_the_speed_of_the_robot() -> None:
