@@ -40,7 +40,7 @@ from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.drawing import CIRCLE, CROSS, NOMINAL_PX, Trail, WindowCompleter, encode_jpeg
 from flowrec.view.entities import ColumnBuffer, EntityLogger, label, points
-from flowrec.view.scene import Scene, goal_of, place_on_chip, way_of
+from flowrec.view.scene import Scene, goal_of, place_on_chip, tracer_ways_um, way_of
 from flowrec.view.state_lanes import StateLogger
 
 _JPEG_QUALITY = 85  # 0 to 100, of OpenCV's encoder
@@ -51,9 +51,6 @@ _SHOWN = (  # fields of a tick, in the order in which they are logged
     *("route", "mission", "track", "estimate", "demand", "applied", "currents"),
     *("health", "timing", "event", "operator", "drops", "losses", "tracers", "measured"),
 )
-_TRACER_S = 0.3  # way of a tracer that its arrow shows
-_LEAST_AGE = 3  # images that show a tracer before it is drawn
-_MOVES = 3.0  # standard deviations of its speed: slower ones stick, or are texture of a wall
 _WORD_SHARE = 0.16, 0.12  # of the view: half the width, and the height, of the longest word about the robot
 
 
@@ -286,11 +283,10 @@ class TickLogger:
 
     def _log_tracers(self, tracers: Tracers) -> None:
         """An arrow from each tracer that moves to where it will be soon."""
-        moves = np.hypot(*tracers.velocity_um_s.T) > _MOVES * tracers.velocity_std_um_s
-        drawn = (tracers.age_frames >= _LEAST_AGE) & moves
-        origins = self._scene.to_plane(place_on_chip(self._tick, tracers.position_um[drawn]))
-        ways = self._scene.directions(self._scene.length_px(1.0) * _TRACER_S * tracers.velocity_um_s[drawn])
-        drawing = rr.Arrows2D(origins=origins, vectors=ways, colors=colours.PURPLE, radii=points(1.0), draw_order=27.0)
+        origins, tips = (self._scene.to_plane(place_on_chip(self._tick, ends)) for ends in tracer_ways_um(tracers))
+        drawing = rr.Arrows2D(
+            origins=origins, vectors=tips - origins, colors=colours.PURPLE, radii=points(1.0), draw_order=27.0
+        )
         self._log(e.TRACERS, drawing)
 
     def _place_of_word(self, centre: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Robot, route and flow drawn over the images by OpenCV, with a status bar below them for clock, state and scale.
+"""Robots, tracers, route and flow drawn over the images by OpenCV, with a status bar below for clock, state and scale.
 
 Nothing covers the robot: within its ring the camera's pixels stay as they are, and all words are in the bar. The image
 stays as the camera took it: where it shakes, or a refinement found another registration, what lies on the chip is
@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Estimate, Floats, FlowField, Tick, shift_px
+from flowrec.core import Estimate, Floats, FlowField, Tick, Tracers, shift_px
 from flowrec.stages import estimates_of_others
 from flowrec.view import colours
 from flowrec.view.colours import round_below
 from flowrec.view.drawing import CIRCLE, NOMINAL_PX, Layer, Picture, Trail, arrows, draw_outline, drawable, restore
 from flowrec.view.flow_values import arrow_grid, flow_arrows
-from flowrec.view.scene import Scene, goal_of, way_of
-from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, StatusBar
+from flowrec.view.scene import Scene, goal_of, tracer_ways_um, way_of
+from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, TRACER, StatusBar
 
 _LEAST_WIDTH_PX = 480  # smaller images are enlarged by a whole factor, so that words and lines are readable
 _LETTER_PX = 13.0
@@ -75,6 +75,8 @@ class Overlay:
         clean = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
         picture = clean.copy()
         self._layer.blend(image, picture)
+        if tick.tracers is not None:
+            self._draw_tracers(picture, tick.tracers)
         if tick.estimate is not None:
             self._draw_robot(picture, clean, tick.estimate)
         for number, estimate in enumerate(estimates_of_others(tick), start=1):
@@ -102,7 +104,7 @@ class Overlay:
         if goal is not None:
             centre, reach = self._to_px(self._scene.to_plane(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
             layer.lines([centre + reach * part for part in GOAL_SIGN], (), GOAL, _LINE_PX * self._unit)
-        self._status_bar.set_legend(goal=goal is not None, route=has_route, flow=flow)
+        self._status_bar.set_legend(goal=goal is not None, route=has_route, tracers=tick.tracers is not None, flow=flow)
         return layer
 
     def _draw_flow(self, layer: Layer, field: FlowField, *, refined: bool) -> tuple[str, float, float] | None:
@@ -137,6 +139,14 @@ class Overlay:
         restore(picture, clean, centre, ring)
         draw_outline(picture, centre + ring * CIRCLE, colour, _LINE_PX * unit)
 
+    def _draw_tracers(self, picture: Picture, tracers: Tracers) -> None:
+        """A line from each tracer that moves to where it will be soon."""
+        off = np.array(shift_px(self._tick.shift))
+        ways = [self.zoom * (self._scene.to_plane(ends) + off) - 0.5 for ends in tracer_ways_um(tracers)]
+        for way in np.stack(ways, axis=1):
+            if drawable(way):
+                draw_outline(picture, way, TRACER, 0.8 * _LINE_PX * self._unit)
+
     def _draw_other(self, picture: Picture, estimate: Estimate, colour: colours.Rgb) -> None:
         """The ring of a robot that is not the mission's."""
         centre = self.zoom * (self._scene.to_plane(estimate.position_um) + np.array(shift_px(self._tick.shift))) - 0.5
@@ -148,7 +158,8 @@ class Overlay:
 def _content_key(tick: Tick) -> tuple[object, ...]:
     """Key of the content of a tick's layer: it is drawn anew where this changes."""
     goal = goal_of(tick.mission)
-    return id(tick.field), id(tick.route), None if goal is None else goal.tobytes(), shift_px(tick.shift)
+    goal_key = None if goal is None else goal.tobytes()
+    return id(tick.field), id(tick.route), goal_key, shift_px(tick.shift), tick.tracers is None
 
 
 def _sparser(points_um: Floats, spacing_um: float) -> tuple[Floats, float]:

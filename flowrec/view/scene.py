@@ -12,11 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flowrec.core import HALF_PX, Floats, Matrix, Mission, Route, Tick, shift_px
+from flowrec.core import HALF_PX, Floats, Matrix, Mission, Route, Tick, Tracers, shift_px
 from flowrec.physics import Calibration, Chip, Robot, on_chip
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom
 _MARGIN = 0.03  # around the channels, of their longer side
+_TRACER_S = 0.3  # way of a tracer that its arrow shows
+_LEAST_AGE = 3  # images that show a tracer before it is drawn
+_MOVES = 3.0  # standard deviations of its speed: slower ones stick, or are texture of a wall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,3 +134,11 @@ def way_of(route: Route | None) -> Floats:
     if route is None or not route.reachable or len(route.waypoints_um) < 2:
         return np.empty((0, 2))
     return route.waypoints_um
+
+
+def tracer_ways_um(tracers: Tracers) -> tuple[Floats, Floats]:
+    """Places (n, 2) of the tracers that move, and where they will be soon."""
+    moves = np.hypot(*tracers.velocity_um_s.T) > _MOVES * tracers.velocity_std_um_s
+    drawn = (tracers.age_frames >= _LEAST_AGE) & moves
+    begins_um = tracers.position_um[drawn]
+    return begins_um, begins_um + _TRACER_S * tracers.velocity_um_s[drawn]

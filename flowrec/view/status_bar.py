@@ -20,6 +20,7 @@ from flowrec.view.colours import Rgb, round_below
 from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, arrows, bgr
 
 ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
+TRACER = colours.PURPLE
 _TEXT, _GROUND = colours.WHITE, (24, 24, 28)
 GOAL_SIGN = (*(np.array([0.5 * arm, arm]) for line in CROSS for arm in line), 0.75 * CIRCLE)  # a crosshair, open inside
 _LONGEST_BAR = 0.16  # of the width of the picture
@@ -47,7 +48,7 @@ class StatusBar:
         self._top = (self._height - round(1.3 * letter_px)) // 2
         self._parts: list[Picture] = []
 
-    def set_legend(self, *, goal: bool, route: bool, flow: tuple[str, float, float] | None) -> None:
+    def set_legend(self, *, goal: bool, route: bool, tracers: bool, flow: tuple[str, float, float] | None) -> None:
         """Set the entries of the legend besides the robot.
 
         `flow`: words before its arrow's speed, such as "refined flow", that speed in um/s, and px per um/s.
@@ -61,6 +62,9 @@ class StatusBar:
         if route:
             px = 1.4 * self._letter
             self._parts.append(self._part(px, "route", ROUTE, [np.array([(0.0, middle), (px, middle)])]))
+        if tracers:
+            px = 0.8 * self._letter
+            self._parts.append(self._part(px, "tracer", TRACER, [np.array([(0.0, middle), (px, middle)])], width=0.8))
         if flow is not None:
             words, speed, px_per_speed = flow
             tail, tip = np.array([[1.0, middle]]), np.array([[1.0 + speed * px_per_speed, middle]])

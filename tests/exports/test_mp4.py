@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import Applied, Frame, SessionError, Tick
+from flowrec.core import Applied, Frame, SessionError, Tick, Tracers
 from flowrec.exports import mp4
 from flowrec.exports.camera_images import with_images
 from flowrec.view import state_text
@@ -153,8 +153,6 @@ def test_the_robot_is_in_its_ring_and_nothing_is_drawn_over_it(session, tmp_path
 
 
 def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_that_was_found(session):
-    from dataclasses import replace
-
     from flowrec.view import Overlay, Scene
 
     tick = replace(session.at(5.0), estimate=None)
@@ -175,13 +173,35 @@ def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_
     assert np.abs(shown - expected)[inside].max() <= 8
 
 
-def test_route_goal_and_robot_are_where_a_shaken_image_shows_them(session):
-    from dataclasses import replace
+def two_tracers(session, stamp_ns: int) -> Tracers:
+    """One that goes 30 px of the camera to the right in a second, and one that lies still."""
+    places_um = session.calibration.to_um(np.array([(60.0, 30.0), (100.0, 90.0)]))
+    velocity_um_s = np.array([session.calibration.to_um(np.array([90.0, 30.0])) - places_um[0], (0.0, 0.0)])
+    two = np.ones(2)
+    return Tracers(
+        stamp_ns, two, places_um, velocity_um_s, two, two, two, 9.0 * two, 0.0 * two, 0.0 * two, places_um, two, 2
+    )
 
+
+def test_a_tracer_that_moves_has_a_line_to_where_it_will_be_soon_and_one_that_lies_still_has_none(session):
+    from flowrec.view import Overlay, Scene
+
+    tick = Tick(stamp_ns=session.at(5.0).stamp_ns)
+    grey = np.full(session.at(5.0).frame.image.shape, 100, np.uint8)
+    overlay = Overlay(Scene(session.chip, session.calibration, session.config.robot, ""), grey.shape[::-1])
+    bare = overlay.draw(grey, tick)[: 3 * grey.shape[0]].astype(int)
+    drawn = overlay.draw(grey, replace(tick, tracers=two_tracers(session, tick.stamp_ns)))[: 3 * grey.shape[0]]
+    rows, columns = np.nonzero(np.abs(drawn.astype(int) - bare).max(axis=-1) > 20)
+    assert rows.mean() / 3 == pytest.approx(30.0, abs=0.5)
+    assert (columns.min() / 3, columns.max() / 3) == pytest.approx((60.0, 69.0), abs=1.0)  # the way of 0.3 s
+
+
+def test_route_goal_robot_and_tracers_are_where_a_shaken_image_shows_them(session):
     from flowrec.core import Shift
     from flowrec.view import Overlay, Scene
 
-    at_rest = replace(session.at(5.0), shift=None)
+    at_rest = session.at(5.0)
+    at_rest = replace(at_rest, shift=None, tracers=two_tracers(session, at_rest.stamp_ns))
     grey = np.full(at_rest.frame.image.shape, 100, np.uint8)
     off_px = np.array([4.0, -2.0])
     scene = Scene(session.chip, session.calibration, session.config.robot, "", image_px=grey.shape[::-1])
