@@ -98,6 +98,8 @@ def _places(session: Session) -> Iterator[tuple[str, pa.Table, str]]:
         yield "observed_flow", observed_flow(last.observations), meaning.format("")
     for number, observations in sorted(observations_of_others(last).items()):
         yield f"observed_flow.robot.{number}", observed_flow(observations), meaning.format(f" by robot {number}")
+    if last.tracer_flow is not None:
+        yield "observed_flow.tracers", observed_flow(last.tracer_flow), meaning.format(" by tracers")
 
 
 class ParquetExport(_Tables):

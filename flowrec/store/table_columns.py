@@ -118,6 +118,7 @@ OBSERVED = {
     "own_u_um_s": "the robot's own motion through the fluid as assumed, along x; it is subtracted already",
     "own_v_um_s": "the robot's own motion through the fluid as assumed, along y; it is subtracted already",
     "time_s": "middle of the time that the flow is a mean over, on the session clock",
+    "tracer": "number of the tracer that was observed, at an unknown height of its own; -1: the robot",
 }
 _NEEDED = 4  # of these columns, the first
 _DEFAULT_STD = 0.05  # of the rms speed, where no standard deviation is given
@@ -134,7 +135,7 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
 
     Parameters
     ----------
-    given : path of a CSV or Excel file; a pandas DataFrame, or anything with columns by name; an array (n, 4 to 8) with
+    given : path of a CSV or Excel file; a pandas DataFrame, or anything with columns by name; an array (n, 4 to 9) with
         the columns in this order; or Observations, which are returned as they are.
     radius_um : of the robot or particle, which the flow carries as a sphere; None: not stated.
     """
@@ -164,7 +165,9 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
         raise UsageError(f"{where}: row {row}: std_um_s is {std[row]:g}; it must be more than zero")
     own = np.column_stack([columns["own_u_um_s"], columns["own_v_um_s"]]) if "own_u_um_s" in columns else None
     place = np.column_stack([columns["x_um"], columns["y_um"]])
-    return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um)
+    tracer = columns.get("tracer")
+    entered = None if tracer is None else np.zeros(n)
+    return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um, tracer, entered)
 
 
 def _given_columns(given: Any) -> tuple[str, dict[str, Floats]]:

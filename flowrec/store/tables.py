@@ -196,7 +196,7 @@ def observed_flow(observations: Observations) -> pa.Table:
     """Observations with a row each, in the columns OBSERVED; what is not stated is empty."""
     rolled = (None, None) if observations.rolled_um_s is None else observations.rolled_um_s.T
     place, flow = observations.position_um.T, observations.flow_um_s.T
-    return _table(OBSERVED, (*place, *flow, observations.std_um_s, *rolled, observations.time_s))
+    return _table(OBSERVED, (*place, *flow, observations.std_um_s, *rolled, observations.time_s, observations.tracer))
 
 
 def field_values(field: FlowField, fluid: Bools) -> pa.Table:

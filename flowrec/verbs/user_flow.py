@@ -68,9 +68,10 @@ def refine(
     Parameters
     ----------
     chip, options : as of `solve`; the boundary values are what is assumed before the measurements.
-    observations : a CSV or Excel file, a DataFrame, columns by name, or an array (n, 4 to 8), with the columns x_um,
-        y_um, u_um_s, v_um_s and, where known, std_um_s, own_u_um_s, own_v_um_s, time_s (tables/observed.py). Places are
-        in the chip frame: x right and y down from the centre of the mask's first pixel.
+    observations : a CSV or Excel file, a DataFrame, columns by name, or an array (n, 4 to 9), with the columns x_um,
+        y_um, u_um_s, v_um_s and, where known, std_um_s, own_u_um_s, own_v_um_s, time_s, tracer: that of each bead of
+        a particle tracking, over stretches of equal length. Places are in the chip frame: x right and y down from the
+        centre of the mask's first pixel.
     method : name of a row of refine.REFINERS.
     radius_um : of the robot or particle whose motion was measured; None: the flow itself was.
     refiner : settings of the methods; `method` goes before its own.

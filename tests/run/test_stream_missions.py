@@ -13,7 +13,7 @@ from flowrec.core import SessionError, UsageError
 from flowrec.exports import export, write_layouts
 from flowrec.rigs.simulated.world import true_pump
 from flowrec.stages import config_from_toml, load_config, to_toml
-from flowrec.store import Session
+from flowrec.store import Session, observations_of
 from flowrec.verbs import replay_session
 from flowrec.verbs.check import check
 from flowrec.verbs.compare import compare
@@ -64,6 +64,10 @@ def test_what_beads_tell_is_the_flow_at_the_nominal_pump_where_its_stream_is_fol
     true = np.array([pump.strength(float(time)) for time in raw.time_s])
     assert len(shares) > 10 and np.ptp(true) > 0.3
     assert np.median(np.abs(shares / true - 1.0)) < 0.06
+    table = Path(export(path, tmp_path / "tables", file_format="csv")) / "observed_flow.tracers.csv"
+    again = observations_of(table)  # as flowrec.refine reads it
+    assert again.tracer is not None and np.array_equal(again.tracer, nominal.tracer)
+    assert np.array_equal(again.flow_um_s, nominal.flow_um_s)
 
 
 def test_a_replay_has_the_same_samples_at_the_same_ticks_and_is_identical(flown: Path, tmp_path: Path) -> None:

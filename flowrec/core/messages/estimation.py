@@ -120,9 +120,9 @@ class RobotWalls(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations(Message):
-    """Local flow measured along the robot's way: the data of a refinement.
+    """Local flow measured along the ways of robots and tracers: the data of a refinement.
 
-    The measured flow is the robot's velocity over ground less its own motion as assumed, `rolled_um_s`. So a wrong um
+    The measured flow is the velocity over ground less a robot's own motion as assumed, `rolled_um_s`. So a wrong um
     per revolution, slip and hindered motion near walls appear as a part of the flow along `rolled_um_s`.
     """
 

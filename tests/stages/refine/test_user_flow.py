@@ -76,12 +76,32 @@ def test_the_observed_flow_of_an_exported_session_is_read_as_it_was_recorded(tmp
         assert (again.rolled_um_s is None) == (recorded.rolled_um_s is None)
 
 
+def test_the_tracks_of_beads_by_number_tell_the_mean_over_the_depth_at_which_each_goes_faster_or_slower(
+    mask: Any,
+) -> None:
+    options: Any = {"um_per_px": 10.0, "inlet_speed_um_s": 100.0, "depth_um": 60.0}
+    assumed = flowrec.solve(mask, **options)
+    rng = np.random.default_rng(2)
+    share = 1.5 * (1.0 - rng.uniform(-1.0, 1.0, 60) ** 2)  # of the flow's mean over the depth, between plates
+    bead = rng.permutation(np.repeat(np.arange(60), np.rint(8.0 * share).astype(int)))  # stretches of equal length
+    places = np.column_stack([rng.uniform(50.0, 550.0, len(bead)), rng.uniform(110.0, 210.0, len(bead))])
+    flow = 1.4 * share[bead, None] * sample(assumed, places)
+    table = {"x_um": places[:, 0], "y_um": places[:, 1], "u_um_s": flow[:, 0], "v_um_s": flow[:, 1], "tracer": bead}
+    found = flowrec.refine(mask, table, **options)
+    unnumbered = flowrec.refine(mask, {name: table[name] for name in list(table)[:4]}, **options)
+    middle = np.s_[16, 30, 0]
+    stated = found.std_um_s[middle] / found.velocity_um_s[middle]
+    ratio, without = (each.velocity_um_s[middle] / assumed.velocity_um_s[middle] for each in (found, unnumbered))
+    assert ratio == pytest.approx(1.4, rel=0.08) and 0.02 < stated < 0.1
+    assert without > 1.55, "as if all beads went with the mean"
+
+
 WRONG: dict[str, tuple[Any, str]] = {
     "no column": (
         {"x_um": [1.0], "y_um": [1.0], "u_um_s": [1.0]},
         r"no column v_um_s; the columns are x_um, y_um, u_um_s",
     ),
-    "three columns": (np.zeros((5, 3)), r"has the shape \(5, 3\) where \(n, 4 to 8\) belongs; the columns are x_um"),
+    "three columns": (np.zeros((5, 3)), r"has the shape \(5, 3\) where \(n, 4 to 9\) belongs; the columns are x_um"),
     "a vector": (np.zeros(4), r"has the shape \(4,\)"),
     "text": ([["a", "b", "c", "d"]], r"are no table of numbers"),
     "an object": (object(), r"are no table of numbers"),
@@ -110,7 +130,7 @@ def test_measurements_that_are_no_such_table_are_refused_in_one_line_that_says_w
 
 
 def test_nan_and_infinity_in_each_column_are_refused(mask: Any) -> None:
-    row = [300.0, 160.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    row = [300.0, 160.0, *np.ones(len(OBSERVED) - 2)]
     for column, name in enumerate(OBSERVED):
         for bad in (np.nan, np.inf, -np.inf):
             table = np.array([row, row])
