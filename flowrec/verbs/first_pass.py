@@ -142,7 +142,16 @@ def _with_robots(asked: Config, p: Pipeline, config: ResolvedConfig, robots: Seq
         image = next(iter(_within(source, config)))
     names, places_px = [f"tracker.robots_px[{n}]" for n in range(len(asked.tracker.robots_px))], asked.tracker.robots_px
     if robots:
-        candidates, _ = _candidates(p, image, look(alone, Sight(), image))
+        seen = _first_seen(alone, config)
+        assert seen is not None, "the movie has a first image"
+        if seen[0].index != image.index and (
+            numbers := [each for each in robots if _PX not in each and "," not in each]
+        ):
+            raise UsageError(
+                f"--robot {numbers[0]}: the picture with the numbers is image {seen[0].index}, and several robots are "
+                f"named in image {image.index}: give each as X,Ypx there"
+            )
+        candidates, _ = _candidates(p, *seen)
         names = [f"--robot {each}" for each in robots]
         places_px = tuple(
             _place_of(each, asked, p) or _place_of_number(each, candidates, image, asked) for each in robots

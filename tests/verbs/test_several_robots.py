@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet
 import pytest
+import tifffile
 
 import flowrec
 from flowrec.core import UsageError
@@ -185,6 +186,20 @@ def test_robots_of_a_movie_are_named_by_numbers_of_its_picture(movie: tuple[Path
         np.testing.assert_allclose(found.robots_px, [from_the_top[each - 1] for each in named], atol=1.0)
     with pytest.raises(UsageError, match=r"--robot 7: .* 3 "):
         fit_import(asked, file.parent, ["1", "7"], align=False)
+
+
+def test_numbers_of_a_picture_that_is_not_the_first_image_name_no_robots(
+    movie: tuple[Path, Path, list[list[float]]], tmp_path: Path
+) -> None:
+    file, log, _ = movie
+    later = tmp_path / "later.ome.tif"
+    with tifffile.TiffFile(file) as read:
+        images, about = read.asarray(), read.ome_metadata
+    images[:4] = np.median(images)  # the robots are in no image before number 4
+    tifffile.imwrite(later, images, description=about.encode(), metadata=None)
+    asked = asked_import(later, load_config(None, IMPORTED), coils=log)
+    with pytest.raises(UsageError, match=r"the numbers is image 4, .* named in image 0: give each as X,Ypx there"):
+        fit_import(asked, tmp_path, ["1", "2"], align=False)
 
 
 def test_a_line_for_each_other_robot_ends_a_run_and_stands_in_its_session(mission: Path) -> None:
