@@ -22,15 +22,16 @@ ASSUMED = SOLVER.solve(DUCT)
 
 
 def of_beads(
-    count: int, seed: int, *, each: int = 12, factor: float = 1.4, cut: int = 0, flat: bool = False
+    count: int, seed: int, *, each: int = 12, factor: float = 1.4, cut: int = 0, flat: float = 0.0
 ) -> Observations:
     """What beads show of `factor` times the assumed flow, at heights that are spread evenly over the depth.
 
     A bead passes `each` stretches in the time in which the mean of the flow over the depth does, one that flows faster
-    more. Its way is lost and found again as another one up to `cut` times.
+    more. Its way is lost and found again as another one up to `cut` times. The profile is `flat` from 0,
+    of plates, to 1.
     """
     rng = np.random.default_rng(seed)
-    c = np.ones(count) if flat else 1.5 * (1.0 - rng.uniform(-1.0, 1.0, count) ** 2)
+    c = flat + (1.0 - flat) * 1.5 * (1.0 - rng.uniform(-1.0, 1.0, count) ** 2)
     body = np.repeat(np.arange(count), np.rint(each * c).astype(int))
     body = body[rng.permutation(len(body))]  # in the order of their times
     parts = [rng.choice(len(body), min(cut, len(body)), replace=False)] if cut else []
@@ -64,13 +65,14 @@ def test_the_mean_over_beads_is_the_flow_however_many_they_are_and_however_often
     assert np.std(ratios) / np.mean(ratios) == pytest.approx(SCATTER / MEAN, rel=0.15)
 
 
-@pytest.mark.parametrize("flat", [False, True])
-def test_where_no_depth_is_stated_the_scatter_of_the_tracers_tells_how_flat_the_profile_is(flat: bool) -> None:
+@pytest.mark.parametrize("flat", [0.0, 0.5, 1.0])
+def test_where_no_depth_is_stated_the_scatter_of_the_tracers_tells_how_flat_the_profile_is(flat: float) -> None:
     chip = replace(DUCT, depth_um=None)
     ratios = [
-        each for seed in range(12) for each in shares(at_mean_height(of_beads(60, seed, flat=flat), ASSUMED, chip))
+        each for seed in range(20) for each in shares(at_mean_height(of_beads(60, seed, flat=flat), ASSUMED, chip))
     ]
-    assert np.mean(ratios) == pytest.approx(1.4, rel=0.05)
+    # Between plates the slowest, which are not followed, are missing from the scatter.
+    assert np.mean(ratios) == pytest.approx(1.4, rel=0.02 if flat else 0.06)
 
 
 def test_what_the_robot_observed_is_left_as_it_is_and_some_of_the_tracers_are_used() -> None:
