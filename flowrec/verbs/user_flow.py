@@ -29,7 +29,7 @@ _OTHER_WAY_UP = 0.8  # of the measured speed in fluid if y is counted upwards, a
 _SLOW = 0.1  # of the fastest assumed flow at the measured places: slower ones say nothing of the unit
 _TIMES = 10.0  # faster or slower than assumed: the unit is doubted
 _SURE, _MAD = 3.0, 1.48  # standard errors; a standard deviation over the median of the deviations
-_BEHIND = 3.0  # times faster than the map: it does not follow what was measured
+_BEHIND = 1.2  # times as fast as the map: it does not follow what was measured
 
 
 class ChipOptions(TypedDict, total=False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,25 @@ def test_speeds_far_above_all_that_the_method_can_follow_are_refused_with_the_un
     assert speed == pytest.approx(150.0 * abs(factor), rel=0.05)
     refined = flowrec.refine(mask, measured, um_per_px=10.0, inlet_speed_um_s=speed)
     assert refined.velocity_um_s[16, 30, 0] == pytest.approx(1.5 * 150.0 * factor, rel=0.05)
+
+
+@pytest.mark.parametrize(("seed", "factor"), [(0, 11.0), (0, 12.0), (2, 13.0)])
+def test_speeds_that_the_method_follows_in_part_give_no_map_that_is_far_more_wrong_than_it_says(
+    seed: int, factor: float
+) -> None:
+    mask = np.zeros((40, 160), np.bool_)
+    mask[10:30] = True
+    options: Any = {"um_per_px": 5.0, "inlet_speed_um_s": 100.0}
+    assumed, rng = flowrec.solve(mask, **options), np.random.default_rng(seed)
+    places = np.column_stack([rng.uniform(20.0, 780.0, 30), rng.uniform(60.0, 135.0, 30)])
+    flow = factor * (sample(assumed, places) + rng.normal(0.0, 3.0, places.shape))
+    try:
+        refined = flowrec.refine(mask, np.hstack([places, flow]), **options)
+    except UsageError:  # of which the test before this one reads the words
+        return
+    assert refined.error_share is not None
+    truth = replace(assumed, velocity_um_s=np.float32(factor) * assumed.velocity_um_s)
+    assert error_of(refined, truth) < 2.0 * refined.error_share
 
 
 def test_speeds_of_another_unit_sign_or_direction_that_the_method_follows_are_told_in_the_note(
