@@ -11,13 +11,14 @@ from .chip.fluid import (
     ViscositySettings as ViscositySettings, blood as blood, law_text as law_text, with_settings as with_settings,
 )
 from .chip.io import (
-    CHIP_KEYS as CHIP_KEYS, MAX_PIXELS as MAX_PIXELS, chip_files as chip_files, chip_from_files as chip_from_files,
+    CHIP_KEYS as CHIP_KEYS, chip_files as chip_files, chip_from_files as chip_from_files,
     load_chip as load_chip, read_case as read_case, read_vessel_case as read_vessel_case,
     without_pockets as without_pockets,
 )
+from .chip.mask_image import MAX_PIXELS as MAX_PIXELS
 from .chip.openings import (
-    border as border, check_chip as check_chip, distance_px as distance_px, distance_um as distance_um,
-    find_openings as find_openings, guess_inlets as guess_inlets, name_inlets as name_inlets,
+    SIDES as SIDES, border as border, check_chip as check_chip, distance_px as distance_px, distance_um as distance_um,
+    find_openings as find_openings, fluid_runs as fluid_runs, guess_inlets as guess_inlets, name_inlets as name_inlets,
     named_opening as named_opening, opening_names as opening_names, run_around as run_around,
     set_inlet_speed as set_inlet_speed,
 )

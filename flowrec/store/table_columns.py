@@ -122,6 +122,9 @@ OBSERVED = {
 }
 _NEEDED = 4  # of these columns, the first
 _DEFAULT_STD = 0.05  # of the rms speed, where no standard deviation is given
+# Times the speed below which 90 % of the moving rows are, of at least so many: faster ones are wild, and say nothing of
+# the scatter of the others.
+_WILD, _USUAL, _FEWEST = 100.0, 0.9, 10
 _NAMES = list(OBSERVED)
 _WANTED = f"the columns are {', '.join(_NAMES[:_NEEDED])} and, where known, {', '.join(_NAMES[_NEEDED:])}"
 
@@ -129,9 +132,9 @@ _WANTED = f"the columns are {', '.join(_NAMES[:_NEEDED])} and, where known, {', 
 def observations_of(given: Any, radius_um: float | None = None) -> Observations:
     """Observations from a table with a row each, in the columns OBSERVED.
 
-    Without `std_um_s` it is 5 % of the root mean square speed. A column that may be left out may be empty. Raises
-    UsageError: one line with the shape and the columns that are wanted: a missing column, another shape, no row, NaN or
-    infinity, a standard deviation that is not more than zero.
+    Without `std_um_s` it is 5 % of the root mean square speed, wild rows left out. A column that may be left out may be
+    empty. Raises UsageError: one line with the shape and the columns that are wanted: a
+    missing column, another shape, no row, NaN or infinity, a standard deviation or a radius that is not more than zero.
 
     Parameters
     ----------
@@ -139,6 +142,8 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
         the columns in this order; or Observations, which are returned as they are.
     radius_um : of the robot or particle, which the flow carries as a sphere; None: not stated.
     """
+    if radius_um is not None and not 0.0 < radius_um < math.inf:
+        raise UsageError(f"radius_um = {radius_um:g}: must be more than zero; leave it out where the flow was measured")
     if isinstance(given, Observations):
         return given
     where, columns = _given_columns(given)
@@ -158,8 +163,9 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
             more = f" (and {len(bad) - 1} more rows)" if len(bad) > 1 else ""
             raise UsageError(f"{where}: row {bad[0]}: {name} is {values[bad[0]]:g}{more}; leave these rows out")
     flow = np.column_stack([columns["u_um_s"], columns["v_um_s"]])
-    rms_um_s = math.sqrt(float((flow**2).sum(axis=1).mean()))
-    std = columns.get("std_um_s", np.full(n, _DEFAULT_STD * rms_um_s))
+    std = columns["std_um_s"] if "std_um_s" in columns else np.full(n, _DEFAULT_STD * _usual_speed(flow))
+    if "std_um_s" not in columns and not std[0] > 0:
+        raise UsageError(f"{where}: all speeds are 0, and no std_um_s says how well that is known; give it")
     if not (std > 0).all():
         row = int(np.argmin(std > 0))
         raise UsageError(f"{where}: row {row}: std_um_s is {std[row]:g}; it must be more than zero")
@@ -168,6 +174,15 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
     tracer = columns.get("tracer")
     entered = None if tracer is None else np.zeros(n)
     return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um, tracer, entered)
+
+
+def _usual_speed(flow: Floats) -> float:
+    """Root mean square speed of the rows (n, 2), but for wild ones."""
+    square = (flow**2).sum(axis=1)
+    moving = square[square > 0.0]
+    if len(moving) >= _FEWEST:
+        square = square[square <= _WILD**2 * np.quantile(moving, _USUAL, method="lower")]
+    return math.sqrt(float(square.mean()))
 
 
 def _given_columns(given: Any) -> tuple[str, dict[str, Floats]]:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 Shown = Literal["speed", "error"]
 _ARROWS = 24  # along the longer side
+_LOW = 4.0  # width over height of a low picture
 _LENGTH = 1.6  # of the fastest arrow, in spaces between arrows
 _SOLID, _PATH = "0.85", "tab:red"
 _PLACE = ("y_um", "x_um")
@@ -200,7 +201,9 @@ class FlowField(Message):
             values, extent=(-0.5 * px, (w - 0.5) * px, (h - 0.5) * px, -0.5 * px), vmin=0.0, interpolation="nearest"
         )
         label = {"speed": "speed (um/s)", "error": "one standard deviation (um/s)"}[show]
-        axes.figure.colorbar(drawn, ax=axes, label=label, fraction=0.046 * h / w, pad=0.03)
+        beside: dict[str, Any] = {"fraction": 0.046 * h / w, "pad": 0.03}
+        below = {"location": "bottom", "fraction": 0.08, "aspect": 40.0}  # the bar of a low picture would be too short
+        axes.figure.colorbar(drawn, ax=axes, label=label, **(below if w > _LOW * h else beside))
         axes.set_facecolor(_SOLID)
         if show == "speed":
             _arrows(axes, self, fluid)
@@ -231,7 +234,8 @@ def fluid_of(field: FlowField) -> Bools:
 
 def _arrows(axes: Axes, field: FlowField, fluid: Bools) -> None:
     step = max(1, max(fluid.shape) // _ARROWS)
-    rows, columns = np.mgrid[step // 2 : fluid.shape[0] : step, step // 2 : fluid.shape[1] : step]
+    h, w = fluid.shape
+    rows, columns = np.mgrid[min(step, h) // 2 : h : step, min(step, w) // 2 : w : step]
     inside = fluid[rows, columns]
     rows, columns = rows[inside], columns[inside]
     velocity = field.velocity_um_s[rows, columns]

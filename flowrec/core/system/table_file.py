@@ -114,9 +114,9 @@ def _is_number(text: str) -> bool:
 
 
 def _plain(name: str) -> str:
-    """A name of a column in one spelling: `Heading (°)` is heading_deg, `Time [s]` is time_s."""
+    """A name of a column in one spelling: `Heading (°)` is heading_deg, `Time [s]` is time_s, `U [µm/s]` is u_um_s."""
     name = _BRACKETS.sub(r" \1 ", name.casefold().replace("°", "deg").replace("µ", "u").replace("μ", "u"))
-    return "_".join(re.split(r"[\s_]+", name.strip(" _\t")))
+    return "_".join(re.split(r"[\s_/]+", name.strip(" _\t")))
 
 
 def _date_s(cell: Any) -> float | None:

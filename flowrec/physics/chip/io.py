@@ -34,7 +34,6 @@ from __future__ import annotations
 import difflib
 import json
 import math
-import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -60,6 +59,7 @@ from flowrec.physics.chip.fluid import (
     law_settings,
     with_settings,
 )
+from flowrec.physics.chip.mask_image import FLUID, greys_of_png
 from flowrec.physics.chip.openings import (
     CHIP_NUMBERS,
     DEFAULT_INLET_UM_S,
@@ -139,12 +139,7 @@ def read_case(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         raise ChipError(f"{path}: not a readable .npz vessel case ({error})") from error
 
 
-MAX_PIXELS = 3_600_000  # the flow field of a larger mask exceeds the largest chunk that a session may have
-# A mask is black and white, but for the blurred edges of its channels.
-_WALL = 128  # grey level of fluid, at least
 _POCKET_PX = 1.0  # level of what is filled
-_BLACK, _WHITE, _MOST_BETWEEN, _MOST_LEVELS = 32, 223, 0.25, 32
-_PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 BUILT_IN: Mapping[str, Callable[[ChipSettings], Chip]] = {
     "bifurcation": lambda _: bifurcation(),
     "straight": lambda _: straight(),
@@ -235,8 +230,8 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
         raise ChipError(f"{where}: no um_per_px; set chip.um_per_px or put it into a TOML of the same name")
     walls = cast(Walls, _choice(table, "walls", get_args(Walls), where) or "smooth")
     fluid = _choice(table, "fluid", ("bright", "dark"), where) or "bright"
-    greys = _greys(png_bytes, fluid, where, between=walls == "grey")
-    mask = np.asarray(greys >= _WALL)
+    greys = greys_of_png(png_bytes, fluid, where, between=walls == "grey")
+    mask = np.asarray(greys >= FLUID)
     mask.flags.writeable = False
     if "opening" in table:
         openings = _openings_of(table["opening"], where)
@@ -301,29 +296,6 @@ def _read_chip(path: Path, um_per_px: float | None) -> Chip:
     except (OSError, UnicodeDecodeError) as error:
         raise ChipError(f"{path}: can not be read ({error}); is it a chip?") from error
     return chip_from_files(data, text, str(path), um_per_px)
-
-
-def _greys(png_bytes: bytes, fluid: str, where: str, between: bool) -> NDArray[np.uint8]:
-    """(h, w) grey levels, fluid is bright; `between`: walls may lie between pixel centres."""
-    grey = None
-    if png_bytes.startswith(_PNG_HEAD) and len(png_bytes) >= len(_PNG_HEAD) + 8:
-        # The size in the header is checked before the image is decoded: a small file could demand gigabytes.
-        width, height = struct.unpack_from(">II", png_bytes, len(_PNG_HEAD))
-        if width * height > MAX_PIXELS:
-            raise ChipError(f"{where}: a mask of {width} x {height} pixels; at most {MAX_PIXELS} are possible")
-        try:
-            grey = cv2.imdecode(np.frombuffer(png_bytes, np.uint8), cv2.IMREAD_GRAYSCALE)
-        except cv2.error:  # a header that promises an impossible image
-            grey = None
-    if grey is None:
-        raise ChipError(f"{where}: the mask is no PNG image, or a damaged one; save it again as 8-bit grey")
-    part = 0.0 if between else float(((grey > _BLACK) & (grey < _WHITE)).mean())
-    if part > _MOST_BETWEEN and len(np.unique(grey)) > _MOST_LEVELS:
-        raise ChipError(
-            f"{where}: a photograph, not a mask: {100 * part:.0f} % of its pixels are neither black nor white; "
-            f"flowrec calibrate chip {where} --um-per-px UM -o CHIP.toml makes the mask of it"
-        )
-    return np.asarray(255 - grey if fluid == "dark" else grey, np.uint8)
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:

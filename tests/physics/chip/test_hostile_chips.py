@@ -4,6 +4,7 @@ import struct
 import tracemalloc
 import zipfile
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,6 +21,31 @@ def test_a_mask_that_promises_more_than_it_has_is_refused():
     for data in (b"BM" + bytes(100), b"\xff\xd8\xff" + bytes(100), b"II*\0" + bytes(100)):
         with pytest.raises(ChipError, match="PNG"):
             chip_from_files(data, "um_per_px = 1.0")
+
+
+def png(image):
+    """An image as PNG: of a channel between walls."""
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+@pytest.mark.parametrize("fluid", ["bright", "dark"])
+def test_a_mask_of_zeros_and_ones_is_refused_with_the_brightness_that_fluid_has(fluid):
+    mask = np.zeros((30, 40), np.uint8)
+    mask[10:20] = 1
+    with pytest.raises(ChipError, match=r"the brightest is 1 of 255, and fluid is 128 or more; save it"):
+        chip_from_files(png(mask), f'um_per_px = 1.0\nfluid = "{fluid}"')
+    assert chip_from_files(png(255 * mask), "um_per_px = 1.0").mask.sum() == mask.sum()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_mask_with_transparent_pixels_is_refused_as_the_colour_under_them_is_not_seen(dtype):
+    grey = np.zeros((30, 40), dtype)
+    grey[10:20] = full = np.iinfo(dtype).max
+    seen = np.full_like(grey, full)
+    assert chip_from_files(png(np.dstack([grey, grey, grey, seen])), "um_per_px = 1.0").mask.sum() == 400
+    seen[12:18, 20:30] = 0
+    with pytest.raises(ChipError, match=r"60 pixels of the mask are transparent: fluid or wall\?"):
+        chip_from_files(png(np.dstack([grey, grey, grey, seen])), "um_per_px = 1.0")
 
 
 def vessel_case(path, mask_header, zeros):

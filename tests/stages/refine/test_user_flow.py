@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "std": (np.array([[300, 160, 1, 1, 0.0]]), r"row 0: std_um_s is 0; it must be more than zero"),
     "half of its own motion": (np.array([[300, 160, 1, 1, 1, 1.0]]), r"own_u_um_s and own_v_um_s belong together"),
     "ragged": ({"x_um": [1.0, 2.0], "y_um": [1.0], "u_um_s": [1.0], "v_um_s": [1.0]}, r"y_um has the shape \(1,\)"),
+    "nothing moves": (np.array([[300, 160, 0, 0], [310, 160, 0, 0]]), r"all speeds are 0, and no std_um_s"),
     "outside": (
         np.array([[300, 160, 1, 1], [300, 9000, 1, 1]]),
         r"1 of 2 places are outside of chip .* row 1, \(300, 9000\)",
@@ -155,3 +157,110 @@ def test_masks_and_chips_that_carry_no_flow_are_refused_in_one_line(mask: Any) -
         with pytest.raises(error) as caught:
             flowrec.solve(given, **options)  # type: ignore[arg-type]
         assert "\n" not in str(caught.value) and isinstance(caught.value, FlowrecError)
+
+
+@pytest.mark.parametrize("factor", [20.0, 1000.0, -1000.0])
+def test_speeds_far_above_all_that_the_method_can_follow_are_refused_with_the_unit_and_the_speed_to_give(
+    mask: Any, measured: Any, factor: float
+) -> None:
+    measured = measured.assign(u_um_s=factor * measured.u_um_s, v_um_s=factor * measured.v_um_s)
+    with pytest.raises(UsageError, match=rf"is {factor * 1.5:g} times the assumed one: is it in um/s\?") as caught:
+        flowrec.refine(mask, measured, um_per_px=10.0, inlet_speed_um_s=100.0)
+    speed = float(str(caught.value).rpartition(" ")[2])
+    assert speed == pytest.approx(150.0 * abs(factor), rel=0.05)
+    refined = flowrec.refine(mask, measured, um_per_px=10.0, inlet_speed_um_s=speed)
+    assert refined.velocity_um_s[16, 30, 0] == pytest.approx(1.5 * 150.0 * factor, rel=0.05)
+
+
+@pytest.mark.parametrize(("seed", "factor"), [(0, 11.0), (0, 12.0), (2, 13.0)])
+def test_speeds_that_the_method_follows_in_part_give_no_map_that_is_far_more_wrong_than_it_says(
+    seed: int, factor: float
+) -> None:
+    mask = np.zeros((40, 160), np.bool_)
+    mask[10:30] = True
+    options: Any = {"um_per_px": 5.0, "inlet_speed_um_s": 100.0}
+    assumed, rng = flowrec.solve(mask, **options), np.random.default_rng(seed)
+    places = np.column_stack([rng.uniform(20.0, 780.0, 30), rng.uniform(60.0, 135.0, 30)])
+    flow = factor * (sample(assumed, places) + rng.normal(0.0, 3.0, places.shape))
+    try:
+        refined = flowrec.refine(mask, np.hstack([places, flow]), **options)
+    except UsageError:  # of which the test before this one reads the words
+        return
+    assert refined.error_share is not None
+    truth = replace(assumed, velocity_um_s=np.float32(factor) * assumed.velocity_um_s)
+    assert error_of(refined, truth) < 2.0 * refined.error_share
+
+
+def test_speeds_of_another_unit_sign_or_direction_that_the_method_follows_are_told_in_the_note(
+    mask: Any, measured: Any
+) -> None:
+    def note(u: Any, v: Any) -> str:
+        table = measured.assign(u_um_s=u, v_um_s=v)
+        return flowrec.refine(mask, table, um_per_px=10.0, inlet_speed_um_s=100.0).note
+
+    u, v = measured.u_um_s, measured.v_um_s
+    assert "is 0.0015 times the assumed one: is it in um/s?" in note(1e-3 * u, 1e-3 * v)
+    assert "runs against the assumed one" in note(-u, -v)
+    assert "runs across the assumed one: are u and v exchanged?" in note(v, u)
+    assert "assumed one" not in note(u, v)
+
+
+def test_places_that_fit_the_chip_with_y_the_other_way_up_are_refused_also_on_a_grid_that_holds_the_solid() -> None:
+    mask = np.zeros((80, 100), np.bool_)
+    mask[10:30] = True
+    truth = flowrec.solve(mask, um_per_px=2.0)
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(4.0, 200.0, 12.0), np.arange(2.0, 160.0, 6.0)))
+    grid = np.column_stack([x, y])
+    flow = sample(truth, grid) * mask[np.rint(y / 2.0).astype(int), np.rint(x / 2.0).astype(int), None]
+    assert flowrec.refine(mask, np.hstack([grid, flow]), um_per_px=2.0).note.startswith("assimilated")
+    upwards = np.column_stack([x, 158.0 - y, flow[:, 0], -flow[:, 1]])
+    with pytest.raises(UsageError, match=r"100 % with y counted from its lower edge: count y downwards"):
+        flowrec.refine(mask, upwards, um_per_px=2.0)
+
+
+def test_a_wild_row_does_not_widen_the_standard_deviation_of_the_others(measured: Any) -> None:
+    alone = observations_of(measured).std_um_s[0]
+    wild = measured.copy()
+    wild.loc[7, "u_um_s"] = 1e7
+    assert observations_of(wild).std_um_s[0] == pytest.approx(alone, rel=0.1)
+    still = np.zeros((300, 4))  # of a grid that holds the solid
+    grid = np.vstack([measured.to_numpy(), still])
+    assert observations_of(grid).std_um_s[0] == pytest.approx(alone * np.sqrt(30.0 / 330.0))
+
+
+@pytest.mark.parametrize("radius_um", [-5.0, 0.0, float("nan"), float("inf")])
+def test_a_radius_that_is_none_is_refused(mask: Any, measured: Any, radius_um: float) -> None:
+    with pytest.raises(UsageError, match=r"radius_um = .* must be more than zero"):
+        flowrec.refine(mask, measured, um_per_px=10.0, radius_um=radius_um)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"um_per_px": 5e-6}, "chip.um_per_px = 5e-06: must be from 0.001 to 1000"),
+        ({"um_per_px": 5.0, "inlet_speed_um_s": -50.0}, "chip.inlet_speed_um_s = -50: must be from 0"),
+        ({"um_per_px": np.float32(5e-6)}, "chip.um_per_px"),
+        ({"um_per_px": "wide"}, "um_per_px = 'wide': must be a number"),
+    ],
+)
+def test_options_outside_of_the_ranges_of_the_settings_are_refused(mask: Any, options: Any, why: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        flowrec.solve(mask, **options)
+    assert why in str(caught.value)
+
+
+def test_the_note_of_a_solved_flow_names_inlets_outlets_closed_openings_and_fluid_that_stands_still() -> None:
+    mask = np.zeros((60, 80), np.bool_)
+    mask[10:20] = mask[40:50] = True
+    mask[20:30, 40:42] = mask[:10, 40:42] = True
+    note = flowrec.solve(mask, um_per_px=5.0).note
+    assert "inlets left:0; outlets left:1, right:0, right:1; closed where fluid meets the border at top 40-41" in note
+    assert note.endswith("800 px of fluid are reached by no inlet and stand still")
+    both = flowrec.solve(mask, um_per_px=5.0, inlets="left").note  # type: ignore[arg-type]
+    assert "inlets left:0, left:1; outlets right:0, right:1" in both and "still" not in both
+
+
+def test_headings_with_their_units_in_brackets_are_known(mask: Any, measured: Any, tmp_path: Path) -> None:
+    file = tmp_path / "measured.csv"
+    measured.to_csv(file, index=False, header=["x [um]", "Y (µm)", "u [um/s]", "V (µm/s)"])
+    assert np.array_equal(observations_of(file).flow_um_s, observations_of(measured).flow_um_s)

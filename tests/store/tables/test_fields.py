@@ -59,6 +59,24 @@ def test_a_field_and_its_error_are_drawn_without_the_true_flow() -> None:
     plt.close("all")
 
 
+def test_a_field_that_is_low_and_wide_has_arrows_and_a_bar_that_can_be_read() -> None:
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.quiver import Quiver
+
+    mask = np.zeros((12, 900), np.bool_)
+    mask[3:9] = True
+    axes = flowrec.solve(mask, um_per_px=2.0).plot()
+    arrows = next(each for each in axes.get_children() if isinstance(each, Quiver))
+    axes.figure.canvas.draw()
+    bar = axes.images[0].colorbar
+    assert arrows.N >= 20 and bar is not None
+    assert bar.ax.get_position().width > 0.8, "along the picture, not as high as it is"
+    plt.close(axes.figure)
+
+
 def test_any_image_is_read_by_its_number_and_a_loop_reads_all_of_them() -> None:
     frames = flowrec.open(GOLDEN).frames
     every = list(frames)
