@@ -53,15 +53,16 @@ def shares(found: Observations) -> list[float]:
     return ((found.flow_um_s * there).sum(axis=1) / (there**2).sum(axis=1)).tolist()
 
 
-@pytest.mark.parametrize("cut", [0, 3])
+@pytest.mark.parametrize("cut", [0, 2])
 @pytest.mark.parametrize("count", [10, 60, 300])
 def test_the_mean_over_beads_is_the_flow_however_many_they_are_and_however_often_they_are_lost(
     count: int, cut: int
 ) -> None:
+    """Of cut ways those of the slowest are too short to be used."""
     ratios: list[float] = []
     for seed in range(2400 // count):
-        ratios += shares(at_mean_height(of_beads(count, seed, cut=cut), ASSUMED, DUCT))
-    assert np.mean(ratios) == pytest.approx(1.4, rel=0.03)
+        ratios += shares(at_mean_height(of_beads(count, seed, each=30, cut=cut), ASSUMED, DUCT))
+    assert np.mean(ratios) == pytest.approx(1.4, rel=0.04 if cut else 0.03)
     assert np.std(ratios) / np.mean(ratios) == pytest.approx(SCATTER / MEAN, rel=0.15)
 
 
@@ -69,7 +70,9 @@ def test_the_mean_over_beads_is_the_flow_however_many_they_are_and_however_often
 def test_where_no_depth_is_stated_the_scatter_of_the_tracers_tells_how_flat_the_profile_is(flat: float) -> None:
     chip = replace(DUCT, depth_um=None)
     ratios = [
-        each for seed in range(20) for each in shares(at_mean_height(of_beads(60, seed, flat=flat), ASSUMED, chip))
+        each
+        for seed in range(20)
+        for each in shares(at_mean_height(of_beads(60, seed, each=30, flat=flat), ASSUMED, chip))
     ]
     # Between plates the slowest, which are not followed, are missing from the scatter.
     assert np.mean(ratios) == pytest.approx(1.4, rel=0.02 if flat else 0.06)
@@ -111,7 +114,7 @@ def test_where_observations_are_averaged_along_the_way_of_the_robot_each_tracer_
 def test_a_tracer_beside_a_wall_that_may_be_off_is_not_used() -> None:
     rows, columns = np.nonzero(DUCT.mask)
     edge = np.array([columns.mean(), rows.min() + 0.4 * LEAST_PX]) * DUCT.um_per_px
-    beads = of_beads(5, 1)
+    beads = of_beads(5, 1, each=30)
     moved = replace(beads, position_um=np.where(beads.tracer[:, None] == 2.0, edge, beads.position_um))
     assert set(at_mean_height(moved, ASSUMED, DUCT).tracer) == set(beads.tracer) - {2.0}
 
