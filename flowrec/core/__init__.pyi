@@ -62,7 +62,8 @@ from .ranges import (
     range_of as range_of,
 )
 from .summary import (
-    DOUBTS as DOUBTS, Figures as Figures, Row as Row, TRACERS as TRACERS, Value as Value, as_text as as_text, body_lines as body_lines,
+    DOUBTS as DOUBTS, Figures as Figures, Row as Row, TRACERS as TRACERS, Value as Value,
+    as_text as as_text, body_lines as body_lines,
     comparison_for_people as comparison_for_people, doubts_of as doubts_of, doubts_text as doubts_text,
     finite as finite, is_count as is_count, is_numeric as is_numeric, is_of_robot as is_of_robot,
     name_of as name_of, of_text as of_text, rows_for_people as rows_for_people, text_of_figure as text_of_figure,

@@ -11,6 +11,7 @@ from .calibrate_motion import (
     heading_settings as heading_settings, remarks as remarks, rows_of as rows_of, sampled_s as sampled_s,
 )
 from .coil_windings import windings_matrix as windings_matrix
+from .images import write_picture as write_picture
 from .motion_fit import MotionFit as MotionFit, UNEXPLAINED as UNEXPLAINED
 from .picture_registration import ImageVerdict as ImageVerdict, orientation_by_image as orientation_by_image
 from .proposal import as_toml as as_toml

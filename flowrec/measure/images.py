@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import Bools, Coverage, Floats, Floats32, Image, UsageError
+from flowrec.core import PICTURE, Bools, Coverage, Floats, Floats32, Image, Output, UsageError
 from flowrec.movies import ReadOptions, median_of, open_movie
 from flowrec.rigs import sha256_of
 from flowrec.store import open as open_session
@@ -126,3 +126,18 @@ def _of_session(path: Path) -> tuple[Image, Coverage]:
     if not images:
         raise UsageError(f"{path}: holds no images; take a session that was recorded with them")
     return median_of(images.values()), Coverage(len(images), session.topics.get("/camera/frame", len(images)), "images")
+
+
+def write_picture(picture: Image, path: Path) -> Path:
+    """Write a picture under a name that no other file has; where it is there already, its path."""
+    done, data = cv2.imencode(PICTURE[0], picture)
+    assert done, "OpenCV writes PNG"
+    number, target = 1, path
+    while target.exists():
+        if target.is_file() and target.read_bytes() == data.tobytes():
+            return target
+        number += 1
+        target = path.with_stem(f"{path.stem}_{number}")
+    with Output(target, PICTURE).new_file() as part:
+        part.write_bytes(data.tobytes())
+    return target

@@ -219,11 +219,6 @@ def observe_others(
     ]
 
 
-def tracks_of_others(tick: Tick, count: int) -> list[Track]:
-    """The latest tracks of the other robots; none before the first image."""
-    return [track for number in range(1, count) if (track := track_of(tick, number)) is not None]
-
-
 def messages_of_others(tracks: Sequence[Track], estimates: Sequence[Estimate], walls: RobotWalls) -> dict[str, Message]:
     """The messages of the other robots, by path."""
     made: dict[str, Message] = {WALLS: walls}

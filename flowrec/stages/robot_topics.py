@@ -69,6 +69,14 @@ def robot_number(path: str) -> int:
     return int(found[1]) if found else 0
 
 
+def tracks_of_others(tick: Tick) -> list[Track]:
+    """The latest tracks of all robots but the first one, in the order of their numbers; none before the first image."""
+    found: list[Track] = []
+    while (track := track_of(tick, len(found) + 1)) is not None:
+        found.append(track)
+    return found
+
+
 def estimates_of_others(tick: Tick) -> list[Estimate]:
     """The latest estimates of all robots but the first one, in the order of their numbers."""
     found: list[Estimate] = []

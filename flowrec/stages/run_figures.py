@@ -28,11 +28,11 @@ from flowrec.core import (
     seconds,
 )
 from flowrec.physics import Chip, Robot, relative_rmse
+from flowrec.stages.estimation.tracer_stretches import SETTLED_FRAMES
 from flowrec.stages.planning.planner import Planner
 from flowrec.stages.planning.survey_ways import METHOD as SURVEY_ROUTE
-from flowrec.stages.robot_topics import observations_topic, track_of
+from flowrec.stages.robot_topics import observations_topic, tracks_of_others
 
-_SETTLED = 2.0  # images: one that fewer have shown may be noise
 CHAIN = ("arrived", "tracked", "commanded", "on the wire", "field")  # stages of the latency, after the exposure
 
 
@@ -102,7 +102,7 @@ class TracerStatistics:
         """Take one tick."""
         if tick.tracers is not None and tick.tracers.stamp_ns == tick.stamp_ns:
             self._images += 1
-            self._shown += int(((tick.tracers.age_frames > _SETTLED) & (tick.tracers.lost_frames == 0)).sum())
+            self._shown += int(((tick.tracers.age_frames > SETTLED_FRAMES) & (tick.tracers.lost_frames == 0)).sum())
         if tick.tracer_flow is not None:
             self._observations = len(tick.tracer_flow.std_um_s)
 
@@ -148,10 +148,8 @@ class RunStatistics:
             self.contacts = tick.truth.contacts
         if tick.timing is not None and tick.timing.arrival_ms is not None:
             self._chain_ms.append(chain_ms(tick.timing))
-        number = 1
-        while (track := track_of(tick, number)) is not None:
+        for number, track in enumerate(tracks_of_others(tick), start=1):
             self._others.setdefault(number, RobotStatistics(number)).write(tick, track)
-            number += 1
         self._tracers.write(tick)
         demand = tick.demand
         if tick.mission is None or tick.mission.phase != Phase.NAVIGATE:

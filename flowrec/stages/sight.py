@@ -12,7 +12,8 @@ from flowrec.core import Appearance, Background, Extra, Frame, Shift, Tick, Trac
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages.control.mission import MissionStateMachine
 from flowrec.stages.inputs import FROM_IMAGE, Inputs
-from flowrec.stages.other_robots import expected_robots, expected_unmoved, tracks_of_others
+from flowrec.stages.other_robots import expected_robots, expected_unmoved
+from flowrec.stages.robot_topics import tracks_of_others
 from flowrec.stages.vision import Expected, Stabiliser, Tracker, move_neighbours, unseen
 
 
@@ -71,7 +72,7 @@ def look(p: Looking, last: Sight, frame: Frame, expected: Sequence[Expected] = (
 
 def find_robots(p: Looking, last: Tick, inputs: Inputs) -> Sight:
     """Position of the robots, when each was last seen, and how they look. A repeated image counts as not seen."""
-    count, known = p.tracker.count, tracks_of_others(last, p.tracker.count)
+    count, known = p.tracker.count, tracks_of_others(last)[: p.tracker.count - 1]
     previous, before = last.track, Sight(*(getattr(last, name) for name in FROM_IMAGE))._replace(others=tuple(known))
     if inputs.applied.repeats_image and previous is not None:
         others = tuple(unseen(each, inputs.stamp_ns) for each in known)
@@ -79,7 +80,7 @@ def find_robots(p: Looking, last: Tick, inputs: Inputs) -> Sight:
     if inputs.frame is None:
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
         new = {name: message for name in FROM_IMAGE if (message := getattr(inputs, name)) is not None}
-        return before._replace(**new, others=tuple(tracks_of_others(Tick(extra=Extra(inputs.extra)), count)))
+        return before._replace(**new, others=tuple(tracks_of_others(Tick(extra=Extra(inputs.extra)))[: count - 1]))
     expected = expected_robots(last, count, inputs.applied, inputs.stamp_ns, p.robot) if known else []
     sight = look(p, before, inputs.frame, expected)
     if sight.others:

@@ -133,8 +133,8 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
     """Observations from a table with a row each, in the columns OBSERVED.
 
     Without `std_um_s` it is 5 % of the root mean square speed, wild rows left out. A column that may be left out may be
-    empty. Raises UsageError: one line with the shape and the columns that are wanted: a
-    missing column, another shape, no row, NaN or infinity, a standard deviation or a radius that is not more than zero.
+    empty. Raises UsageError: one line with the shape and the columns that are wanted: a missing column, another shape,
+    no row, NaN or infinity, a standard deviation or a radius that is not more than zero.
 
     Parameters
     ----------
@@ -171,9 +171,7 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
         raise UsageError(f"{where}: row {row}: std_um_s is {std[row]:g}; it must be more than zero")
     own = np.column_stack([columns["own_u_um_s"], columns["own_v_um_s"]]) if "own_u_um_s" in columns else None
     place = np.column_stack([columns["x_um"], columns["y_um"]])
-    tracer = columns.get("tracer")
-    entered = None if tracer is None else np.zeros(n)
-    return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um, tracer, entered)
+    return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um, columns.get("tracer"))
 
 
 def _usual_speed(flow: Floats) -> float:

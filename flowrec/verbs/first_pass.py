@@ -26,7 +26,6 @@ from flowrec.core import (
     Frame,
     Image,
     Ints,
-    Output,
     Track,
     UsageError,
     say,
@@ -34,6 +33,7 @@ from flowrec.core import (
     shift_px,
     warn,
 )
+from flowrec.measure import write_picture
 from flowrec.rigs import MovieSource
 from flowrec.stages import (
     MOST,
@@ -137,22 +137,13 @@ def _with_robots(asked: Config, p: Pipeline, config: ResolvedConfig, robots: Seq
 
     `robots`: as of `first_pass`; none: those of tracker.robots_px.
     """
-    alone = replace(p, tracker=replace(p.tracker, robots=1, robots_px=()))
     with MovieSource(config.movie, config.coils) as source:
         image = next(iter(_within(source, config)))
     names, places_px = [f"tracker.robots_px[{n}]" for n in range(len(asked.tracker.robots_px))], asked.tracker.robots_px
     if robots:
-        seen = _first_seen(alone, config)
-        assert seen is not None, "the movie has a first image"
-        if seen[0].index != image.index and (
-            numbers := [each for each in robots if _PX not in each and "," not in each]
-        ):
-            raise UsageError(
-                f"--robot {numbers[0]}: the picture with the numbers is image {seen[0].index}, and several robots are "
-                f"named in image {image.index}: give each as X,Ypx there"
-            )
-        candidates, _ = _candidates(p, *seen)
         names = [f"--robot {each}" for each in robots]
+        numbered = [each for each in robots if _place_of(each, asked, p) is None]
+        candidates = _numbered_places(numbered[0], image, p, config) if numbered else np.zeros((0, 2))
         places_px = tuple(
             _place_of(each, asked, p) or _place_of_number(each, candidates, image, asked) for each in robots
         )
@@ -171,6 +162,18 @@ def _with_robots(asked: Config, p: Pipeline, config: ResolvedConfig, robots: Seq
                 "robot's size and darkness is found; give the middle of a robot"
             )
     return replace(asked, tracker=replace(asked.tracker, robots=count, robots_px=places_px))
+
+
+def _numbered_places(number: str, image: Frame, p: Pipeline, config: ResolvedConfig) -> Floats:
+    """Places (n, 2) in px that the picture numbers; UsageError with one of them where it is not the first image."""
+    seen = _first_seen(replace(p, tracker=replace(p.tracker, robots=1, robots_px=())), config)
+    assert seen is not None, "the movie has a first image"
+    if seen[0].index != image.index:
+        raise UsageError(
+            f"--robot {number}: the picture with the numbers is image {seen[0].index}, and several robots are named in "
+            f"image {image.index}: give each as X,Ypx there"
+        )
+    return _candidates(p, *seen)[0]
 
 
 def _place_of_number(robot: str, places_px: Floats, image: Frame, asked: Config) -> tuple[float, float]:
@@ -386,18 +389,3 @@ def _draw_numbers(image: Image, places_px: Floats, p: Pipeline) -> NDArray[np.ui
             cv2.circle(shown, at, radius, colour, thick, cv2.LINE_AA)
             cv2.putText(shown, text, corner, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick + 1, cv2.LINE_AA)
     return np.asarray(shown, np.uint8)
-
-
-def write_picture(picture: Image, path: Path) -> Path:
-    """Write a picture under a name that no other file has; where it is there already, its path."""
-    done, data = cv2.imencode(PICTURE[0], picture)
-    assert done, "OpenCV writes PNG"
-    number, target = 1, path
-    while target.exists():
-        if target.is_file() and target.read_bytes() == data.tobytes():
-            return target
-        number += 1
-        target = path.with_stem(f"{path.stem}_{number}")
-    with Output(target, PICTURE).new_file() as part:
-        part.write_bytes(data.tobytes())
-    return target

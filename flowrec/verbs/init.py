@@ -232,9 +232,9 @@ def _movie_subject(movie: Path, coils: Path | None, given: Mapping[str, Any]) ->
 def _lab_subject(given: Mapping[str, Any], folder: Path, no_chip: bool) -> _Subject:
     """The camera that is found, and a picture of it; and the ports at which the amplifier may be."""
     from flowrec.core import RigError, say
+    from flowrec.measure import write_picture
     from flowrec.rigs import first_camera
     from flowrec.stages import AMPLIFIERS, CAMERAS, load_config
-    from flowrec.verbs.first_pass import write_picture
 
     asked = load_config(None, {"rig": "lab", **given})
     camera = replace(asked.camera, rate_hz=asked.camera.rate_hz or 30.0)
@@ -283,8 +283,7 @@ def _answers(
 ) -> dict[str, Any]:
     """Answers of the person at the terminal, by setting or option; before that the openings are drawn."""
     from flowrec.core import UsageError, say
-    from flowrec.measure import draw_outline
-    from flowrec.verbs.first_pass import write_picture
+    from flowrec.measure import draw_outline, write_picture
 
     openings = ""
     if seen is not None:

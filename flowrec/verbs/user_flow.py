@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
-import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import ArrayLike
 
 from flowrec.core import Bools, Floats, FlowField, Observations, UsageError, cells_at, check_ranges, nearest_pixels
@@ -21,6 +20,7 @@ from flowrec.physics import (
     load_chip,
     opening_names,
     sample,
+    without_pockets,
 )
 from flowrec.stages import Refiner
 from flowrec.store import observations_of
@@ -160,9 +160,8 @@ def _openings_text(chip: Chip) -> str:
         for first, last in fluid_runs(border(chip.mask, side))
         if last > first and not any(o.side == side and o.first <= last and first <= o.last for o in chip.openings)
     ]
-    labels, _ = scipy.ndimage.label(chip.mask)
-    reached = [border(labels, o.side)[o.first] for o in chip.openings if o.kind == "inlet"]
-    still = np.count_nonzero(chip.mask & ~np.isin(labels, reached))
+    reached = without_pockets(replace(chip, openings=tuple(o for o in chip.openings if o.kind == "inlet")))
+    still = np.count_nonzero(chip.mask & ~reached.mask)
     return "; ".join(
         kinds
         + ([f"closed where fluid meets the border at {', '.join(closed)}"] if closed else [])

@@ -13,7 +13,7 @@ AtNominal = Callable[[Observations, Floats, Floats], Observations | None]
 CAPACITY = 2000  # beyond it some tracers are left out, evenly over the run
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # multiples of it, less their whole parts, spread evenly (Weyl 1916)
 _LEAST_MOVED = 5.0  # standard deviations of the distance: what has not moved so far is stuck
-_SETTLED = 2.0  # images: a first stretch begins with the third, see vision/tracers.py
+SETTLED_FRAMES = 2.0  # a first stretch begins with the third image, see vision/tracers.py: before, it may be noise
 _FLOOR_UM_S = 2.0  # least sigma of an observation
 
 
@@ -39,7 +39,7 @@ def collect_stretches(
     began_um, ended_um = before.from_um[old], tracers.from_um[known]
     std_um = np.sqrt(2.0) * tracers.std_um[known]
     # The first stretch begins where the velocity has settled.
-    settled = before.age_frames[old] > _SETTLED
+    settled = before.age_frames[old] > SETTLED_FRAMES
     moved = np.hypot(*(ended_um - began_um).T) > _LEAST_MOVED * std_um
     over = (ended_s > began_s) & moved & settled
     if not over.any():

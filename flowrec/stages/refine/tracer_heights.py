@@ -13,6 +13,7 @@ around an assumed flow is used for the mean.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -80,9 +81,14 @@ def _mean_share(beads: Observations, assumed: FlowField) -> float:
         return MEAN
     ratio = (predicted * beads.flow_um_s).sum(axis=1)[flows] / power[flows]
     lasted = 1.0 / np.maximum(ratio, _SLOWEST_SHARE * max(float(np.median(ratio)), 1e-9))
+    return 1.0 + float(np.interp(_scatter(ratio, lasted), _scatters(), _FROM_FLAT)) ** 2 * (MEAN - 1.0)
+
+
+@functools.cache
+def _scatters() -> list[float]:
+    """The scatter over time of each profile of _FROM_FLAT."""
     plates = 1.5 * (1.0 - ((np.arange(_HEIGHTS) + 0.5) / _HEIGHTS) ** 2)
-    scatters = [_scatter(1.0 + each * (plates - 1.0), np.ones(_HEIGHTS)) for each in _FROM_FLAT]
-    return 1.0 + float(np.interp(_scatter(ratio, lasted), scatters, _FROM_FLAT)) ** 2 * (MEAN - 1.0)
+    return [_scatter(1.0 + each * (plates - 1.0), np.ones(_HEIGHTS)) for each in _FROM_FLAT]
 
 
 def _scatter(values: Floats, weight: Floats) -> float:

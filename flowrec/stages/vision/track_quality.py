@@ -21,7 +21,7 @@ import numpy as np
 
 from flowrec.core import Appearance, Floats, Shift, Tick, Track, seconds, shift_px
 from flowrec.physics import Calibration, Robot
-from flowrec.stages.robot_topics import track_of
+from flowrec.stages.robot_topics import tracks_of_others
 from flowrec.stages.vision.assignment import EXPECTED_FRAMES
 from flowrec.stages.vision.foreground import correlation
 from flowrec.stages.vision.learned import ReducedScale
@@ -65,12 +65,10 @@ class TrackQuality:
     def write(self, tick: Tick) -> None:
         """Take one tick, with the tracks of all robots."""
         self.take(tick.track, tick.appearance, tick.shift)
-        number = 1
-        while (track := track_of(tick, number)) is not None:
-            if number > len(self._others):
+        for number, track in enumerate(tracks_of_others(tick)):
+            if number == len(self._others):
                 self._others.append(TrackQuality(self._calibration, self._image_shape, self._robot))
-            self._others[number - 1].take(track, None, tick.shift)
-            number += 1
+            self._others[number].take(track, None, tick.shift)
 
     def take(self, track: Track | None, appearance: Appearance | None, shift: Shift | None) -> None:
         """Take the latest messages of these kinds; a track counts once."""
