@@ -159,3 +159,13 @@ def test_a_run_tells_how_many_tracers_it_followed_and_that_it_found_none() -> No
             statistics.write(Tick(each.stamp_ns, tracers=each, tracer_flow=flow if count else None))
         statistics.write(Tick(seen[-1].stamp_ns + 1, tracers=seen[-1], tracer_flow=flow if count else None))
         assert told in str(statistics.others["tracers"])
+
+
+def test_a_tracer_that_an_image_does_not_show_is_not_counted_in_it() -> None:
+    ways = np.array([[40.0, 60.0], [90.0, 60.0]]) + np.zeros((12, 1, 1))
+    ways[9:, 1] = np.nan
+    statistics = RunStatistics()
+    for each in followed(ways)[2:]:  # both are kept in all, and the last three of ten show one
+        assert each.count == 2
+        statistics.write(Tick(each.stamp_ns, tracers=each))
+    assert "1.7 an image, 0 flow observations" in str(statistics.others["tracers"])
