@@ -96,6 +96,9 @@ class Tracers(Message):
     from_um: Annotated[Matrix, Shape("n", 2), "place at which the present stretch of its way begins"]
     from_s: Annotated[Vector, Shape("n"), "time of that on the session clock"]
     next_id: Annotated[int, "number of the next body"]
+    missed_s: Annotated[
+        Vector | None, Shape("n"), "time of that stretch over which no image showed it; None: not known, an older file"
+    ] = None
 
     @property
     def count(self) -> int:

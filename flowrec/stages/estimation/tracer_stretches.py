@@ -14,6 +14,9 @@ CAPACITY = 2000  # beyond it some tracers are left out, evenly over the run
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # multiples of it, less their whole parts, spread evenly (Weyl 1916)
 _LEAST_MOVED = 5.0  # standard deviations of the distance: what has not moved so far is stuck
 SETTLED_FRAMES = 2.0  # a first stretch begins with the third image, see vision/tracers.py: before, it may be noise
+# Of the time of a stretch, without an image that shows the tracer. In two surveys of 50 beads 45 % of the stretches
+# that were missed for longer were of no body, or of two, and 0.8 % of the others.
+MOST_MISSED_SHARE = 0.1
 _FLOOR_UM_S = 2.0  # least sigma of an observation
 
 
@@ -27,8 +30,8 @@ def collect_stretches(
 
     A stretch has ended for each tracer of `tracers` that begins another one, see `Tracers.from_um`. The place is the
     middle of its ends, the standard deviation that of their difference. One that has not moved tells no flow: it sticks
-    to the floor. `at_nominal` makes observations, of the times at which they began and ended, those of the flow of the
-    map.
+    to the floor. One that images do not show for a part of it may be of no body, or of two. `at_nominal` makes
+    observations, of the times at which they began and ended, those of the flow of the map.
     """
     if before is None or tracers is None or tracers is before or not before.count:
         return previous
@@ -42,6 +45,8 @@ def collect_stretches(
     settled = before.age_frames[old] > SETTLED_FRAMES
     moved = np.hypot(*(ended_um - began_um).T) > _LEAST_MOVED * std_um
     over = (ended_s > began_s) & moved & settled
+    if before.missed_s is not None:
+        over &= before.missed_s[old] <= MOST_MISSED_SHARE * (ended_s - began_s)
     if not over.any():
         return previous
     lasted_s = (ended_s - began_s)[over]

@@ -18,13 +18,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.core import Bools, Floats, FlowField, Observations, cells_at
+from flowrec.core import Floats, FlowField, Observations, cells_at
 from flowrec.physics import Chip, clearance_um, sample
 
 MEAN, SCATTER = 1.2, float(np.sqrt(54.0 / 35.0 - 1.44))  # of c between plates, over stretches
-# Of a way. In 18 flights with 50 and 200 beads 15 to 33 % of the stretches of ways of less than eight were of no body,
-# or of two, and 1 to 2 % of longer ones. Of ways of eight alone too many of the slow ones would be missing.
-_LEAST_STRETCHES = 5
 # Of a tracer's speed, one standard deviation by which c differs along its way: it settles, and lags near side walls.
 VARIES_SHARE = 0.1
 # Pixels of the mask from a wall: nearer to it than walls may be off, a predicted speed says nothing of a tracer's.
@@ -48,7 +45,6 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
         return observations
     mean_share = MEAN if chip.depth_um is not None else _mean_share(observations.only(beads), assumed)
     ours = np.flatnonzero(beads)
-    ours = ours[_of_ways(observations.tracer[ours])]
     middles = (np.arange(min(MOST, len(ours))) + 0.5) / min(MOST, len(ours))
     chosen = ours[(middles * len(ours)).astype(np.intp)]  # evenly in the order of their times
     observations = observations.only(np.concatenate([np.flatnonzero(~beads), chosen]))
@@ -59,12 +55,6 @@ def at_mean_height(observations: Observations, assumed: FlowField, chip: Chip) -
     return replace(observations, flow_um_s=flow_um_s, std_um_s=np.hypot(observations.std_um_s / mean, varied))
 
 
-def _of_ways(tracer: Floats) -> Bools:
-    """(n,) which observations belong to a way of some stretches, or to as long a one as there is."""
-    _, index, stretches = np.unique(tracer, return_inverse=True, return_counts=True)
-    return np.asarray(stretches[index] >= min(_LEAST_STRETCHES, stretches.max(initial=0)))
-
-
 def _mean_share(beads: Observations, assumed: FlowField) -> float:
     """Mean of c over the stretches of tracers: 1 in a flat profile, MEAN between plates.
 
@@ -72,7 +62,7 @@ def _mean_share(beads: Observations, assumed: FlowField) -> float:
     tracers show over time, each stretch by the ratio of its speed to the assumed one there: the range of the middle
     80 % over the median, which an assumed flow that is wrong by one factor leaves, and so does a tenth that lies still.
     By ways, of which some are of two tracers, it would be too small. In drawn samples the mean is at most 1 % off,
-    between plates 5 % too small, because the slowest are not followed.
+    between plates 2 % too small, because the slowest pass no stretch.
     """
     predicted = sample(assumed, beads.position_um)
     power = (predicted**2).sum(axis=1)

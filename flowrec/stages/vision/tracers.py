@@ -50,6 +50,7 @@ class _Bodies(NamedTuple):
     entered: Floats
     from_um: Floats
     from_s: Floats
+    missed_s: Floats
 
     def only(self, which: Bools) -> _Bodies:
         return _Bodies(*(column[which] for column in self))
@@ -108,7 +109,7 @@ class TracerTracker:
             radius_um = self.search(1.0, robot).radius_px
             bodies = _predict(previous, dt, robot, _DIFFUSION_UM3_MPA / (chip.viscosity_mpa_s * radius_um))
         rows, columns = assign(bodies.position_um, bodies.std_um**2 + std_um**2, spots_um)
-        bodies = self._next_stretch(_correct(bodies, rows, spots_um[columns], std_um), robot, now_s)
+        bodies = self._next_stretch(_correct(bodies, rows, spots_um[columns], std_um), robot, now_s, dt)
         kept = bodies.lost_frames * dt <= self.keep_s
         kept &= _in_view(bodies.position_um, walls, calibration)
         free = np.ones(len(spots_um), np.bool_)
@@ -119,7 +120,7 @@ class TracerTracker:
         joined = _Bodies(*(np.concatenate(pair) for pair in zip(bodies.only(kept), born, strict=True)))
         return Tracers(frame.stamp_ns, **joined._asdict(), next_id=next_id + len(born.id))
 
-    def _next_stretch(self, bodies: _Bodies, robot: Robot, now_s: float) -> _Bodies:
+    def _next_stretch(self, bodies: _Bodies, robot: Robot, now_s: float, dt: float) -> _Bodies:
         """Begin the next stretch of the way of each body that has ended one."""
         away_um = np.hypot(*(bodies.position_um - bodies.from_um).T)
         over = (away_um >= self.stretch_radii * robot.radius_um) | (now_s - bodies.from_s >= self.stretch_s)
@@ -128,6 +129,7 @@ class TracerTracker:
         return bodies._replace(
             from_um=np.where(over[:, None], bodies.position_um, bodies.from_um),
             from_s=np.where(over, now_s, bodies.from_s),
+            missed_s=np.where(over, 0.0, bodies.missed_s + dt * (bodies.lost_frames > 0.0)),
         )
 
 
@@ -196,6 +198,7 @@ def _predict(previous: Tracers, dt: float, robot: Robot, diffusion_um2_s: float)
         p.entered,
         p.from_um,
         p.from_s,
+        np.zeros(p.count) if p.missed_s is None else p.missed_s,
     )
 
 
@@ -241,6 +244,7 @@ def _new_bodies(spots_um: Floats, first: int, entered: Floats, std_um: float, ro
         entered,
         spots_um,
         zeros + now_s,
+        zeros,
     )
 
 

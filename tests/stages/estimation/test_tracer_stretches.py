@@ -9,12 +9,15 @@ from flowrec.core import NS_PER_S, Tracers
 from flowrec.stages.estimation.tracer_stretches import CAPACITY, collect_stretches
 
 
-def tracers(time_s: float, from_um: list, from_s: list, position_um: list, age: float = 20.0) -> Tracers:
+def tracers(
+    time_s: float, from_um: list, from_s: list, position_um: list, age: float = 20.0, missed_s: list | None = None
+) -> Tracers:
     """Two bodies, the numbers 4 and 7."""
     one, place = np.ones(2), np.array(position_um, float)
     return Tracers(
         round(time_s * NS_PER_S), np.array([4.0, 7.0]), place, np.zeros((2, 2)), one, one, one, age * one, 0 * one,
         np.array([0.0, 1.0]), np.array(from_um, float), np.array(from_s, float), 8,
+        None if missed_s is None else np.array(missed_s),
     )  # fmt: skip
 
 
@@ -41,6 +44,14 @@ def test_what_sticks_or_is_new_tells_no_flow() -> None:
     moved = tracers(2.0, [[100.0, 0.0], [10.0, 0.0]], [2.0, 1.0], START)
     assert collect_stretches(None, new, moved) is None
     assert collect_stretches(None, before, moved) is not None
+
+
+@pytest.mark.parametrize(("missed_s", "counts"), [(None, True), (0.0, True), (0.09, True), (0.11, False)])
+def test_a_stretch_that_images_do_not_show_for_over_a_tenth_of_its_time_tells_no_flow(missed_s, counts) -> None:
+    missed = None if missed_s is None else [missed_s, 0.0]
+    before = tracers(1.9, START, [1.0, 1.0], [[90.0, 0.0], [11.0, 0.0]], missed_s=missed)
+    after = tracers(2.0, [[100.0, 0.0], [10.0, 0.0]], [2.0, 1.0], [[100.0, 0.0], [11.0, 0.0]], missed_s=[0.0, 0.0])
+    assert (collect_stretches(None, before, after) is not None) is counts
 
 
 def test_of_more_stretches_than_are_kept_all_of_some_tracers_stay_from_every_part_of_the_run() -> None:

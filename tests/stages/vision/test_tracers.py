@@ -99,6 +99,13 @@ def test_a_body_that_leaves_is_dropped_and_one_that_is_hidden_for_a_moment_is_ke
     assert end.age_frames.tolist() == [16.0] and end.next_id == 2
 
 
+def test_the_time_over_which_images_miss_a_body_counts_from_the_beginning_of_its_stretch() -> None:
+    ways = straight(np.array([[20.0, 60.0]]), np.array([[1.0, 0.0]]), 24)  # stretches of six images, from the third on
+    ways[10:12] = np.nan
+    missed = [round(each.missed_s[0] * RATE_HZ) for each in followed(ways)]
+    assert missed == [*[0] * 10, 1, 2, 2, 2, *[0] * 10]
+
+
 def test_nothing_of_the_robot_is_a_tracer() -> None:
     place = np.array([80.0, 60.0])
     seen = Track(0, True, place * UM, 1.0, 0, 6.0, np.zeros(4))
