@@ -46,11 +46,11 @@ def test_what_sticks_or_is_new_tells_no_flow() -> None:
     assert collect_stretches(None, before, moved) is not None
 
 
-@pytest.mark.parametrize(("missed_s", "counts"), [(None, True), (0.0, True), (0.09, True), (0.11, False)])
+@pytest.mark.parametrize(("missed_s", "counts"), [(None, True), (0.0, True), (0.19, True), (0.21, False)])
 def test_a_stretch_that_images_do_not_show_for_over_a_tenth_of_its_time_tells_no_flow(missed_s, counts) -> None:
     missed = None if missed_s is None else [missed_s, 0.0]
-    before = tracers(1.9, START, [1.0, 1.0], [[90.0, 0.0], [11.0, 0.0]], missed_s=missed)
-    after = tracers(2.0, [[100.0, 0.0], [10.0, 0.0]], [2.0, 1.0], [[100.0, 0.0], [11.0, 0.0]], missed_s=[0.0, 0.0])
+    before = tracers(2.9, START, [1.0, 1.0], [[90.0, 0.0], [11.0, 0.0]], missed_s=missed)
+    after = tracers(3.0, [[100.0, 0.0], [10.0, 0.0]], [3.0, 1.0], [[100.0, 0.0], [11.0, 0.0]], missed_s=[0.0, 0.0])
     assert (collect_stretches(None, before, after) is not None) is counts
 
 
