@@ -180,6 +180,7 @@ _BEFORE: dict[str, Any] = {
     "refine.place_robot": False,
     "refine.correct_robot": False,
     "refine.correct_heading": False,
+    "refine.correct_lag": False,
     "refine.adopt": "always",
     "mission.wait_at_goal_s": 0.0,
     "recording.admission_s": 0.0,

@@ -18,7 +18,6 @@ from flowrec.core import (
     Action,
     Applied,
     AxesCheck,
-    Estimate,
     Floats,
     Floats32,
     FlowField,
@@ -32,7 +31,6 @@ from flowrec.core import (
     TopicTable,
     Track,
     UsageError,
-    bilinear,
     nearest_pixel,
     seconds,
 )
@@ -42,9 +40,7 @@ from flowrec.physics import (
     Chip,
     FlowSolver,
     Robot,
-    SphereBetweenWalls,
     clearance_um,
-    on_chip,
     sample,
 )
 from flowrec.stages.config import ResolvedConfig, calibration_of
@@ -58,6 +54,7 @@ from flowrec.stages.estimation.superposition import Superposition
 from flowrec.stages.estimation.tracer_stretches import collect_stretches
 from flowrec.stages.extra_topics import ExtraStage, extra_rows, topics_of
 from flowrec.stages.inputs import Inputs, with_inputs
+from flowrec.stages.learned_robot import learned_robot, place_on_chip
 from flowrec.stages.other_robots import (
     OtherRobots,
     messages_of_others,
@@ -165,31 +162,6 @@ def _hand_share(inputs: Inputs) -> Floats | None:
     return hand.share if hand is not None and hand.held and hand.stamp_ns == inputs.stamp_ns else None
 
 
-def _place_on_chip(estimate: Estimate, refined: FlowField | None) -> Estimate:
-    """The estimate with its position on the chip, by the registration that the refinement found."""
-    if refined is None or refined.registration is None:
-        return estimate
-    return replace(estimate, position_um=on_chip(refined.registration, estimate.position_um))
-
-
-def _between_walls(p: Pipeline, last: Tick, refined: FlowField | None, known: Robot) -> Robot:
-    """The known robot with the um per revolution that a refinement found for the place where it was a tick ago."""
-    if refined is None or last.estimate is None:
-        return known
-    point = _place_on_chip(last.estimate, refined).position_um / p.chip.um_per_px
-    if not np.isfinite(point).all():
-        return known
-    point = np.clip(point, 0.0, np.array(p.clearance_um.shape[::-1]) - 1.0)
-    near_px = np.array([bilinear(p.clearance_um, *point.tolist()) / p.chip.um_per_px])
-    sphere = SphereBetweenWalls.of(p.robot.radius_um / p.chip.um_per_px, near_px, p.widths.at(point[None]))
-    found = p.robot.um_per_rev_at(float(sphere.drag[0]), refined)
-    if found is None:
-        return known
-    # At a higher frequency than the fastest one by which the robot is stated to go it may step out.
-    slower = min(found / known.um_per_rev, 1.0)
-    return replace(known, um_per_rev=found, max_speed_um_s=slower * known.max_speed_um_s)
-
-
 @functools.lru_cache(maxsize=2)
 def _without_registration(flow: FlowField) -> FlowField:
     """A map for an observer that reads it where the image shows the robot, whatever a refinement found."""
@@ -281,20 +253,16 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     track, appearance = sight.track, sight.appearance
     assert track is not None, "the tracker says of every image whether it shows the robot"
     lap("track")
-    if p.refiner.correct_robot:
-        known, seen = p.robot.learned_from(tick.refined), flow
-        here = _between_walls(p, last, tick.refined, known)
-    else:
-        known, seen = p.robot, None if flow is None else _without_registration(flow)
-        here = known
-    turn = known.course_turn(tick.refined) if p.refiner.correct_heading else None
+    learned = learned_robot(p, last, tick.refined, flow)
+    known, here = learned.known, learned.here
+    seen = flow if p.refiner.correct_robot or flow is None else _without_registration(flow)
     rolled = p.response.proportional_turns(last.applied, inputs.applied)
-    applied = rolled if turn is None else replace(rolled, turns=turn @ rolled.turns)
+    applied = learned.correct_turns(last.applied, rolled)
     estimate = p.observer.estimate(last.estimate, track, applied, here, seen, last.health)
     # Sessions recorded before step-out was monitored replay without it.
     looked = applied if applied.image_since_ns is not None else None
     # Observations, their predictions and the pictures keep to the registration as stated.
-    placed = _place_on_chip(estimate, tick.refined)
+    placed = place_on_chip(estimate, tick.refined)
     wall_um = _wall_um(p, placed.position_um)
     health = last.health
     if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
@@ -302,9 +270,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     mapless, measured = last.mapless, estimate
     if p.sampler.without_map:
         # Observations are those of the robot as stated: what a refinement finds of it, the next one finds again.
-        corrected = here is not p.robot or turn is not None
         mapless = p.observer.without_map(
-            last.mapless, last.estimate, estimate, track, rolled, p.robot, corrected=corrected
+            last.mapless, last.estimate, estimate, track, rolled, p.robot, corrected=learned.is_other_than(p.robot)
         )
         measured = p.observer.measured_estimate(mapless, estimate)
     before = None if last.estimate is None else p.observer.measured_estimate(last.mapless, last.estimate)
@@ -365,8 +332,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO
     cut = cut or mission.field_off or (mission.by_hand and hand_share is None)
-    # Of a robot that leaves its heading, the heading is turned back by as much.
-    ordered = demand if turn is None else replace(demand, velocity_um_s=turn.T @ demand.velocity_um_s)
+    steered = driven_um_s is None and hand_share is None
+    ordered_um_s = learned.heading_velocity(demand.velocity_um_s, robot.speed_limit_um_s, slips=steered)
+    ordered = demand if ordered_um_s is demand.velocity_um_s else replace(demand, velocity_um_s=ordered_um_s)
     currents = p.coils.drive(last.currents, ordered, p.response.responding(robot), mission.finished, cut)
     lap("control")
     tick = replace(

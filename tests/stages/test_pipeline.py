@@ -15,9 +15,11 @@ from flowrec.stages import Inputs, assemble, step
 
 @pytest.fixture(scope="module")
 def navigation(session, tmp_path_factory):
-    """The stages of a mission, with an observer that uses no map, and its ticks on the way to the goal."""
+    """The stages of a mission, with an observer that uses no map and knows of no lag, and its ticks on the way to the
+    goal.
+    """
     again = tmp_path_factory.mktemp("navigation") / "s.mcap"
-    flowrec.replay(session, out=again, frames=True, observer="kalman")
+    flowrec.replay(session, out=again, frames=True, observer="kalman", sets=["refine.correct_lag=false"])
     recorded = flowrec.open(again)
     ticks = [tick for tick in recorded.ticks() if tick.mission and tick.mission.phase == Phase.NAVIGATE]
     return assemble(recorded.config, recorded.chip), ticks
@@ -170,6 +172,38 @@ def test_the_course_that_a_refinement_found_turns_observer_and_coils_and_no_obse
     assert flown(10.0, std=6.0).estimate.same_as(plain.estimate), "not significant"
     stated = replace(pipeline, refiner=replace(pipeline.refiner, correct_heading=False))
     assert flown(10.0, pipeline=stated).estimate.same_as(plain.estimate)
+
+
+@pytest.mark.slow("flies two missions")
+def test_beside_walls_observer_and_coils_know_that_the_flow_carries_a_sphere_more_slowly_and_observations_stay_raw(
+    navigation,
+):
+    stated, ticks = navigation
+    pipeline = replace(stated, refiner=replace(stated.refiner, correct_lag=True))
+
+    def flown(share, pipeline=pipeline, count=26):
+        found = replace(ticks[3].field, parameter_names="sphere_share", parameters=np.array([share]))
+        last = replace(ticks[3], refined=replace(found, parameter_std=np.array([0.4])))
+        return after(pipeline, last, ticks[4 : 4 + count])
+
+    plain, lagging = flown(0.0), flown(1.0)
+    chip, field, at_um = pipeline.chip, ticks[3].field, plain.estimate.position_um
+    near = pipeline.clearance_um[tuple(np.rint(at_um / chip.um_per_px).astype(int)[::-1])]
+    wide = chip.um_per_px * float(pipeline.widths.at(at_um[None] / chip.um_per_px)[0])
+    radius, far, flow = pipeline.robot.radius_um, wide - near, sample(field, at_um)
+    held = 5.0 / 16.0 * (far - near) * ((radius / near) ** 3 / far - (radius / far) ** 3 / near)
+    step = 0.5 * radius * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    laplacian = (sample(field, at_um + step).sum(axis=0) - 4.0 * flow) / (0.5 * radius) ** 2
+    slip = radius**2 / 6.0 * laplacian - held * flow
+    size = np.hypot(*slip)
+    assert size > 0.03 * np.hypot(*flow) and slip @ flow < 0.0, "or there is nothing to see"
+    more = lagging.estimate.flow_um_s - plain.estimate.flow_um_s
+    assert np.hypot(*(more + slip)) < 0.35 * size, "the filter follows with a delay"
+    heading, hz = lagging.currents.heading_rad, lagging.currents.frequency_hz
+    ordered = pipeline.robot.um_per_rev * hz * np.array([np.cos(heading), np.sin(heading)])
+    assert np.hypot(*(lagging.demand.velocity_um_s - ordered - slip)) < 0.3 * size
+    assert lagging.observations.same_as(plain.observations)
+    assert flown(1.0, stated).estimate.same_as(plain.estimate)
 
 
 def test_an_observer_that_corrects_the_map_reads_it_where_the_registration_puts_the_robot(navigation):

@@ -114,6 +114,8 @@ class Refiner:
     correct_robot: bool = True
     # Observer, health and coils take the angle that it found between the robot's heading and its course.
     correct_heading: bool = True
+    # Observer, health and coils take how much more slowly than the fluid it found the flow to carry the robot.
+    correct_lag: bool = True
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)
     ni: Ni = field(default_factory=Ni)
