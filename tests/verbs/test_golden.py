@@ -4,7 +4,7 @@ The numerics of the first are version 1, in which the velocities of a flow field
 loop and its planner made of the recorded inputs, fields included, is still computed to the last digit; of the two
 fields themselves, the flow behind them is still the same. The second, of the moderate world, has a survey by
 information, stretch by stretch, and numerics version 3. The third has the settled format, its digest chained over
-the chunks, and numerics version 5; the fourth has the walls of its first image, and numerics version 8: as long as
+the chunks, and numerics version 5; the fourth has the walls of its first image, and numerics version 9: as long as
 those hold, every message of it is computed again to the last digit.
 """
 
@@ -26,7 +26,7 @@ from flowrec.verbs import session_replay as verb
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 MODERATE = GOLDEN.with_name("golden_moderate.mcap")
 SETTLED = GOLDEN.with_name("golden_numerics5.mcap")
-TRACED = GOLDEN.with_name("golden_numerics8.mcap")
+TRACED = GOLDEN.with_name("golden_numerics9.mcap")
 BY_OTHER_NUMERICS = {"/flow/assumed", "/flow/refined"}
 
 
