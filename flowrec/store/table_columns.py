@@ -129,21 +129,24 @@ _NAMES = list(OBSERVED)
 _WANTED = f"the columns are {', '.join(_NAMES[:_NEEDED])} and, where known, {', '.join(_NAMES[_NEEDED:])}"
 
 
-def observations_of(given: Any, radius_um: float | None = None) -> Observations:
+def observations_of(given: Any, radius_um: float | None = None, window_um: float | None = None) -> Observations:
     """Observations from a table with a row each, in the columns OBSERVED.
 
     Without `std_um_s` it is 5 % of the root mean square speed, wild rows left out. A column that may be left out may be
     empty. Raises UsageError: one line with the shape and the columns that are wanted: a missing column, another shape,
-    no row, NaN or infinity, a standard deviation or a radius that is not more than zero.
+    no row, NaN or infinity, a standard deviation, radius or side that is not more than zero.
 
     Parameters
     ----------
     given : path of a CSV or Excel file; a pandas DataFrame, or anything with columns by name; an array (n, 4 to 9) with
         the columns in this order; or Observations, which are returned as they are.
     radius_um : of the robot or particle, which the flow carries as a sphere; None: not stated.
+    window_um : side of the square over which each velocity is a mean; None: it is that at its place.
     """
-    if radius_um is not None and not 0.0 < radius_um < math.inf:
-        raise UsageError(f"radius_um = {radius_um:g}: must be more than zero; leave it out where the flow was measured")
+    sizes = {"radius_um": (radius_um, "the flow was measured"), "window_um": (window_um, "no windows were used")}
+    for name, (size, otherwise) in sizes.items():
+        if size is not None and not 0.0 < size < math.inf:
+            raise UsageError(f"{name} = {size:g}: must be more than zero; leave it out where {otherwise}")
     if isinstance(given, Observations):
         return given
     where, columns = _given_columns(given)
@@ -171,7 +174,9 @@ def observations_of(given: Any, radius_um: float | None = None) -> Observations:
         raise UsageError(f"{where}: row {row}: std_um_s is {std[row]:g}; it must be more than zero")
     own = np.column_stack([columns["own_u_um_s"], columns["own_v_um_s"]]) if "own_u_um_s" in columns else None
     place = np.column_stack([columns["x_um"], columns["y_um"]])
-    return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um, columns.get("tracer"))
+    return Observations(
+        0, place, flow, std, own, columns.get("time_s"), radius_um, columns.get("tracer"), window_um=window_um
+    )
 
 
 def _usual_speed(flow: Floats) -> float:

@@ -76,6 +76,7 @@ def refine(
     *,
     method: str = "assimilate",
     radius_um: float | None = None,
+    window_um: float | None = None,
     refiner: Refiner | None = None,
     solver: FlowSolver | None = None,
     **options: Unpack[ChipOptions],
@@ -94,6 +95,8 @@ def refine(
         centre of the mask's first pixel.
     method : name of a row of refine.REFINERS.
     radius_um : of the robot or particle whose motion was measured; None: the flow itself was.
+    window_um : side of the interrogation windows of a particle image velocimetry, over which each velocity is a mean;
+        None: each is that at its place.
     refiner : settings of the methods; `method` goes before its own.
 
     Raises
@@ -105,7 +108,7 @@ def refine(
     """
     solver = solver or FlowSolver()
     chosen = _chip(chip, options)
-    measured = observations_of(observations, radius_um)
+    measured = observations_of(observations, radius_um, window_um)
     _check_places(measured, chosen)
     assumed = solver.solve(chosen)
     refined = replace(refiner or Refiner(), method=method).refine(assumed, measured, chosen, solver)

@@ -152,6 +152,10 @@ class Observations(Message):
     entered: Annotated[
         Vector | None, Shape("n"), "1 for a tracer that came in while it was watched, see Tracers; None: no tracers"
     ] = None
+    window_um: Annotated[
+        float | None,
+        "side of the square around each place over which the flow is a mean; None: it is that at the place",
+    ] = None
 
     def with_robots(self, others: Mapping[int, Observations]) -> Observations:
         """The observations of the first robot, then those of others by their numbers; itself if there are none.
@@ -191,7 +195,11 @@ class Observations(Message):
             name: None if array is None or theirs[name] is None else np.concatenate((array, theirs[name]))
             for name, array in self._arrays().items()
         }
-        return replace(more, radius_um=more.radius_um if self.radius_um == more.radius_um else None, **joined)
+        scalars = ("radius_um", "window_um")
+        joined |= {
+            name: getattr(more, name) if getattr(self, name) == getattr(more, name) else None for name in scalars
+        }
+        return replace(more, **joined)
 
     def _arrays(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name, _ in array_fields(Observations)}

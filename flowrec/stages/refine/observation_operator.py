@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,30 @@ Disturbance = tuple[str, Floats]  # name, and (p, n, 2) what 1 um/s of each unkn
 
 TAIL = 4.0  # degrees of freedom of the observations' Student-t noise
 RELATIVE_NOISE = 0.03  # of the measured speed, in addition to its std: what pixels can not represent
+
+
+class Window(NamedTuple):
+    """The square around each point over whose fluid an observation is a mean."""
+
+    side_px: float
+    mask: NDArray[np.bool_]  # (h, w) of the fluid
+
+    def stencils(self, points: Floats) -> tuple[NDArray[np.intp], Floats]:
+        """Pixels (n, m), the nearest first, and their parts (n, m) of the fluid in the squares around points (n, 2)."""
+        half, (h, w) = 0.5 * self.side_px, self.mask.shape
+        first = np.floor(points - half + 0.5).astype(np.intp)
+        at = first[:, None] + np.arange(int(np.ceil(self.side_px)) + 1)[:, None]  # (n, k, 2)
+        low, high = (points - half)[:, None], (points + half)[:, None]
+        covered = np.maximum(np.minimum(at + 0.5, high) - np.maximum(at - 0.5, low), 0.0)
+        covered[(at < 0) | (at >= [w, h])] = 0.0
+        columns, rows = np.clip(at[..., 0], 0, w - 1), np.clip(at[..., 1], 0, h - 1)
+        pixels = (rows[:, :, None] * w + columns[:, None, :]).reshape(len(points), -1)
+        weights = (covered[..., 1][:, :, None] * covered[..., 0][:, None, :]).reshape(pixels.shape)
+        weights *= self.mask.ravel()[pixels]
+        nearest = nearest_pixels(points, self.mask.shape)
+        order = np.argsort(pixels != (nearest[0] * w + nearest[1])[:, None], axis=1, kind="stable")
+        pixels, weights = (np.take_along_axis(each, order, axis=1) for each in (pixels, weights))
+        return pixels, weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +57,7 @@ class ObservationOperator:
     radius_px: float | None = None  # of the robot; None: not stated
     disturbances: tuple[Disturbance, ...] = ()  # see disturbances.py
     tracer: Floats | None = None  # (n,) number of the tracer that was observed, -1: the robot; None: all are of it
+    window: Window | None = None  # over which each is a mean; None: that at its point
 
     @property
     def count(self) -> int:
@@ -79,7 +105,7 @@ class ObservationOperator:
 
     def with_walls(self, wall_px: NDArray[np.float32]) -> ObservationOperator:
         """The operator in a field with the walls of a raster (h, w), see FlowField."""
-        pixels, weights = _stencils(self.points, wall_px.shape, wall_px)
+        pixels, weights = _stencils(self.points, wall_px.shape, wall_px, self.window)
         return replace(self, pixels=pixels, weights=weights)
 
     def beside(
@@ -90,7 +116,8 @@ class ObservationOperator:
         In a field with the walls of a raster (h, w), on the fluid pixels of a mask.
         """
         points = np.clip(self.points + steps[:, None], 0.0, np.array(mask.shape[::-1]) - 1.0)
-        both = (np.split(each, len(steps)) for each in _stencils(points.reshape(-1, 2), wall_px.shape, wall_px))
+        stencils = _stencils(points.reshape(-1, 2), wall_px.shape, wall_px, self.window)
+        both = (np.split(each, len(steps)) for each in stencils)
         number = _fluid_number(mask)
         return tuple(
             replace(self, points=at, pixels=pixels, weights=weights).renumber(number)
@@ -133,7 +160,11 @@ def observation_operator(
         finite &= True if more is None else np.isfinite(more.reshape(len(finite), -1)).all(axis=1)
     usable = finite & cells_at(points, mask.shape).inside
     usable[usable] = mask[nearest_pixels(points[usable], mask.shape)]
-    pixels, weights = _stencils(points[usable], mask.shape, wall_px)
+    side_px = 0.0 if observations.window_um is None else observations.window_um / um_per_px
+    window = (
+        Window(side_px, mask) if side_px > 1.0 else None
+    )  # a mean over less than a pixel is the value in its middle
+    pixels, weights = _stencils(points[usable], mask.shape, wall_px, window)
     unusable = ((~finite, "without finite numbers"), (finite & ~usable, "outside the fluid"))
     return ObservationOperator(
         points[usable],
@@ -147,6 +178,7 @@ def observation_operator(
         None if observations.time_s is None else observations.time_s[usable],
         None if observations.radius_um is None else observations.radius_um / um_per_px,
         tracer=None if observations.tracer is None else observations.tracer[usable],
+        window=window,
     )
 
 
@@ -158,9 +190,11 @@ def _fluid_number(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def _stencils(
-    points: Floats, shape: tuple[int, ...], wall_px: NDArray[np.float32] | None
+    points: Floats, shape: tuple[int, ...], wall_px: NDArray[np.float32] | None, window: Window | None = None
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Pixels (n, m) and weights (n, m) of `flow.sample` at points (n, 2) in px."""
+    """Pixels (n, m) and weights (n, m) of `flow.sample` at points (n, 2) in px, or of its mean over their windows."""
+    if window is not None:
+        return window.stencils(points)
     if wall_px is not None and min(shape) > 1:
         return pixel_weights(wall_px, points)
     cells = cells_at(points, shape)

@@ -1,8 +1,11 @@
 """The observation operator on the image, on the fluid pixels, and on a network's crop."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from flowrec.core import nearest_pixels
 from flowrec.core.messages import Observations
 from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
@@ -34,6 +37,35 @@ def test_the_prediction_is_the_sampled_field(observed):
     _, velocity, operator = operator_of(observed)
     assert operator.count == len(observed[2].std_um_s)
     np.testing.assert_allclose(operator.predict(velocity.reshape(-1, 2)), operator.flow_um_s, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("side_px", [2.5, 7.0])
+def test_the_prediction_over_windows_is_the_mean_over_their_fluid_also_where_they_are_moved(observed, side_px):
+    case, _, observations = observed
+    mask, px = case.chip.mask, case.chip.um_per_px
+    velocity = np.random.default_rng(4).standard_normal((*mask.shape, 2)) * mask[..., None]
+    operator = observation_operator(replace(observations, window_um=side_px * px), mask, px, case.true.wall_px)
+    axis = side_px * ((np.arange(120) + 0.5) / 120.0 - 0.5)
+    around = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    steps = np.array([[0.0, 0.0], [0.5, -0.5]])
+    for step, moved in zip(steps, operator.beside(steps, case.true.wall_px, mask), strict=True):
+        at = (operator.points + step)[::23, None] + around
+        rows, columns = nearest_pixels(at, mask.shape)
+        inside = mask[rows, columns] & ((at > -0.5) & (at < np.array(mask.shape[::-1]) - 0.5)).all(axis=-1)
+        expected = (velocity[rows, columns] * inside[..., None]).sum(axis=1) / inside.sum(axis=1)[:, None]
+        found = moved.predict(velocity[mask])[::23]
+        np.testing.assert_allclose(found, expected, atol=0.02)
+    assert (operator.pixels[:, 0] == observation_operator(observations, mask, px, None).pixels[:, 0]).all()
+
+
+def test_a_mean_over_less_than_a_pixel_is_the_value_at_the_place(observed):
+    case, _, observations = observed
+    small = replace(observations, window_um=0.6 * case.chip.um_per_px)
+    operators = [
+        observation_operator(each, case.chip.mask, case.chip.um_per_px, case.true.wall_px)
+        for each in (small, observations)
+    ]
+    np.testing.assert_array_equal(operators[0].weights, operators[1].weights)
 
 
 def test_it_predicts_the_same_on_the_fluid_pixels_and_on_a_crop_as_on_the_image(observed):

@@ -97,6 +97,24 @@ def test_the_tracks_of_beads_by_number_tell_the_mean_over_the_depth_at_which_eac
     assert without > 1.55, "as if all beads went with the mean"
 
 
+def test_windows_of_half_a_channel_are_means_and_without_their_side_the_walls_seem_off(
+    mask: Any, truth: FlowField
+) -> None:
+    rng = np.random.default_rng(3)
+    side_um, (rows, columns) = 120.0, np.nonzero(mask[:, 8:52])
+    chosen = rng.choice(len(rows), 40, replace=False)
+    places = 10.0 * np.column_stack([columns[chosen] + 8.0, rows[chosen]])
+    grid = side_um * (np.stack(np.meshgrid(np.arange(48.0), np.arange(48.0)), -1).reshape(-1, 2) / 47.0 - 0.5)
+    at_um = places[:, None] + grid
+    inside = np.abs(at_um[..., 1] - 155.0) < 120.0  # of the channel's middle
+    flow = (sample(truth, at_um) * inside[..., None]).sum(axis=1) / inside.sum(axis=1)[:, None]
+    table = np.column_stack([places, flow + rng.normal(0.0, 3.0, flow.shape), np.full(40, 3.0)])
+    options: Any = {"um_per_px": 10.0, "inlet_speed_um_s": 100.0}
+    found, as_points = (flowrec.refine(mask, table, window_um=side, **options) for side in (side_um, None))
+    assert error_of(found, truth) < 0.02 and "walls" not in found.note
+    assert error_of(as_points, truth) > 0.08, "what the side is for"
+
+
 WRONG: dict[str, tuple[Any, str]] = {
     "no column": (
         {"x_um": [1.0], "y_um": [1.0], "u_um_s": [1.0]},
@@ -228,10 +246,11 @@ def test_a_wild_row_does_not_widen_the_standard_deviation_of_the_others(measured
     assert observations_of(grid).std_um_s[0] == pytest.approx(alone * np.sqrt(30.0 / 330.0))
 
 
-@pytest.mark.parametrize("radius_um", [-5.0, 0.0, float("nan"), float("inf")])
-def test_a_radius_that_is_none_is_refused(mask: Any, measured: Any, radius_um: float) -> None:
-    with pytest.raises(UsageError, match=r"radius_um = .* must be more than zero"):
-        flowrec.refine(mask, measured, um_per_px=10.0, radius_um=radius_um)
+@pytest.mark.parametrize("size", [-5.0, 0.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["radius_um", "window_um"])
+def test_a_size_that_is_none_is_refused(mask: Any, measured: Any, name: str, size: float) -> None:
+    with pytest.raises(UsageError, match=rf"{name} = .* must be more than zero; leave it out where"):
+        flowrec.refine(mask, measured, um_per_px=10.0, **{name: size})  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(
