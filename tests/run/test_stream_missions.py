@@ -54,12 +54,14 @@ def test_what_beads_tell_is_the_flow_at_the_nominal_pump_where_its_stream_is_fol
     told = []
     for number, follows in enumerate(([], ["pump.channel=pump/flow"])):
         path = tmp_path / f"{number}.mcap"
-        record(load_config(None, [*SMALL, *PULSE, *PUMP, *beads, *follows]), path, duration_s=3.0)
+        record(load_config(None, [*SMALL, *PULSE, *PUMP, *beads, *follows]), path, duration_s=4.0)
         with Session(path) as session:
             told.append(list(session.ticks())[-1].tracer_flow)
             pump = true_pump(session.config.simulated)
     raw, nominal = told
-    assert raw is not None and nominal is not None and np.array_equal(raw.tracer, nominal.tracer)
+    assert raw is not None and nominal is not None
+    raw = raw.only(slice(len(nominal.tracer)))  # of the last one the pump's samples may not be there yet
+    assert np.array_equal(raw.tracer, nominal.tracer)
     shares = np.hypot(*raw.flow_um_s.T) / np.hypot(*nominal.flow_um_s.T)
     true = np.array([pump.strength(float(time)) for time in raw.time_s])
     assert len(shares) > 10 and np.ptp(true) > 0.3
