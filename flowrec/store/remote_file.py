@@ -200,17 +200,13 @@ class RemoteFile(Closing):
         return opened
 
     def _range(self, first: int, length: int) -> Answer:
-        answer = self._answer(self._object.requests, first, length)
-        self._refuse_other(answer, self._object.tail)
+        answer, before = self._answer(self._object.requests, first, length), self._object.tail
+        if (answer.version, answer.size) != (before.version, before.size):  # it is of another object
+            forget(self.path)
+            raise SessionError(f"{self.path}: was replaced while it was read; open it again")
         if (answer.first, len(answer.data)) != (first, length):
             raise SessionError(f"{self.path}: the server sent other bytes than those that were asked for")
         return answer
-
-    def _refuse_other(self, answer: Answer, before: Answer) -> None:
-        """Raise SessionError where an answer is not of the same object as one before."""
-        if (answer.version, answer.size) != (before.version, before.size):
-            forget(self.path)
-            raise SessionError(f"{self.path}: was replaced while it was read; open it again")
 
     def _answer(self, asked: ObjectRequests, first: int | None, length: int) -> Answer:
         answer = ask_repeatedly(

@@ -37,7 +37,7 @@ from flowrec.rigs.simulated.beads import Beads
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
 from flowrec.rigs.simulated.others import OtherRobot, other_robots
-from flowrec.rigs.simulated.pump_sensor import PumpSensor
+from flowrec.rigs.simulated.pump import PumpSensor
 from flowrec.rigs.simulated.world import (
     Shake,
     TrueCoils,
