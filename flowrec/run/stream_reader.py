@@ -2,7 +2,7 @@
 
 - The queue is bounded; of samples that the loop does not take the oldest are lost, and counted.
 - A stamp a tenth of a second before its predecessor, or in the future, is a step of the sender's clock. From there on
-  the stamps are shifted so that the samples are as old on arrival as before the step. Smaller steps pass.
+  the stamps are shifted so that the samples are as old on arrival as before the step. Smaller steps stay.
 - A gap in the stamps of a regular stream counts as missing samples, less those that then come closer together.
 - A sender that has ended is looked for again.
 """

@@ -28,8 +28,8 @@ from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout
 _END_BYTES, _HEAD_BYTES = 512 << 10, 256 << 10
 _AHEAD_BYTES = 64 << 20
 _GAP_BYTES, _JOINED_BYTES = 64 << 10, 16 << 20
-_BLOCK_BYTES = 4 << 20  # for who reads on
-_NEAR_BYTES = 1 << 20  # what is read so near before the known end is fetched up to it
+_BLOCK_BYTES = 4 << 20  # that are asked for at a time where one read begins at the end of the one before
+_NEAR_BYTES = 1 << 20  # a read that ends so near before the known end is extended up to that
 _REMEMBERED, _REMEMBERED_S = 64, 60.0  # openings, and for how long they hold
 _TOGETHER = 8  # objects that are opened at a time
 

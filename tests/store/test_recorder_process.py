@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from flowrec.store import (
     shared_queue,
 )
 from flowrec.store.session_file import Snapshot, Split
+from flowrec.store.write_queue import End, Entry
 from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 from tests.store.test_chunk_copies import messages_of
@@ -79,6 +81,7 @@ def test_parts_snapshots_and_declared_topics_pass_through_a_process(tmp_path):
 def test_a_part_begins_with_the_last_image_before_it_whatever_its_memory_is_used_for(tmp_path, monkeypatch, block):
     monkeypatch.setattr(shared_queue, "_STATE_BYTES" if block else "_IMAGE_BYTES", 50_000)
     monkeypatch.setattr(shared_queue, "_MARGIN_BYTES", 1000)
+    monkeypatch.setattr(shared_queue, "_END_BYTES", 100)
     options = replace(OWN, block=block, files=Split(seconds=0.2), queue_limit_bytes=1 << 20)
     with SessionWriter(tmp_path / "p.mcap", HEADER, options) as writer:
         for tick in ticks_of(200):  # faster than they are written: the memory is always full
@@ -106,6 +109,22 @@ def test_whoever_waits_for_a_flush_goes_on_at_the_very_stamp_that_was_flushed():
         recorder.mark_flushed(stamp_ns)
         waiting.join(HANG_S)
         assert not waiting.is_alive() and not recorder.flush_wanted
+    os.close(read)
+    os.close(write)
+
+
+def test_a_run_whose_recorder_stands_still_until_nothing_has_room_still_tells_its_end(monkeypatch):
+    monkeypatch.setattr(shared_queue, "_STATE_BYTES", 1 << 20)
+    queue, (read, write) = shared_queue.SharedQueue(1 << 20, images=False), os.pipe()
+    queue.wake_by(write)
+    recorder = shared_queue.QueueReader(queue.handles, read)
+    with pytest.raises(SessionError, match="behind"):
+        deque(map(queue.put, itertools.repeat(Entry(0, {}, 0))), maxlen=0)
+    end = End({"outcome": "failed", "note": 2000 * "x"})
+    queue.close(end)
+    while (entry := recorder.take(0.0)) is not None:
+        recorder.release(entry)
+    assert recorder.end == end
     os.close(read)
     os.close(write)
 
