@@ -10,13 +10,12 @@ walks 0.09 um in a second. Particles drift with the flow or lie still.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from flowrec.core import UM_PER_M, Bools, Floats, Floats32, FlowField, bilinear, compiled
 from flowrec.physics import Chip, Robot, sample, velocity_at, walls_of
-from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Hindrance, hindered_velocity
+from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Around, Hindrance, hindered_velocity
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.world import true_pump
 from flowrec.stages import Simulated
@@ -26,21 +25,8 @@ _CORRELATION_S = 1.0  # of the wander
 _BOLTZMANN_J_K = 1.380649e-23
 
 
-class _Around(NamedTuple):
-    """Flow and walls around a robot of a radius in um."""
-
-    velocity: Floats32  # (h, w, 2) of the steady flow
-    wall_px: Floats32
-    strength: float  # of the flow now over the steady one
-    clearance: Floats32  # (h, w) from pixel centres to walls, um
-    um_per_px: float
-    radius: float
-    hindrance: float  # share of it, 0 to 1
-    walls: Floats32  # as of `walls_around`
-
-
 @compiled
-def _moves(x: float, y: float, own_x: float, own_y: float, around: _Around) -> tuple[float, float]:
+def _moves(x: float, y: float, own_x: float, own_y: float, around: Around) -> tuple[float, float]:
     """Velocity of the robot at (x, y) um."""
     px, strength = around.um_per_px, around.strength
     if around.hindrance == 0.0:
@@ -52,14 +38,12 @@ def _moves(x: float, y: float, own_x: float, own_y: float, around: _Around) -> t
         vx, vy = velocity_at(around.velocity, around.wall_px, (x + dx) / px, (y + dy) / px)
         flow[n, 0] = strength * vx
         flow[n, 1] = strength * vy
-    return hindered_velocity(
-        x, y, own_x, own_y, flow, around.hindrance, around.clearance, around.walls, px, around.radius
-    )
+    return hindered_velocity(x, y, own_x, own_y, flow, around)
 
 
 @compiled
 def _swim(
-    x: float, y: float, own_x: float, own_y: float, dt: float, noise: Floats, around: _Around
+    x: float, y: float, own_x: float, own_y: float, dt: float, noise: Floats, around: Around
 ) -> tuple[float, float, int, float]:
     """Advance by len(noise) midpoint steps of dt. Returns x, y (um), steps that touched a wall, last clearance."""
     clearance, um_per_px, radius = around.clearance, around.um_per_px, around.radius
@@ -181,7 +165,7 @@ class Swimmer:
         self.gone = not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5)
 
     def _run(self, own_x: float, own_y: float, dt: float, noise: Floats) -> tuple[int, float]:
-        around = _Around(
+        around = Around(
             self._field.velocity_um_s,
             walls_of(self._field),
             self._pump.strength(self._time_s - 0.5 * dt * len(noise)),
