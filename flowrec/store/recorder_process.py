@@ -133,7 +133,7 @@ class RecorderProcess:
             self.queue.wake_by(self._child.process.stdin.fileno())
             refusal: str = self._child.receive()
         except ChildEndedError as error:
-            raise SessionError(f"{plan.path}: its recorder does not start ({error})") from error
+            refusal = f"{plan.path}: its recorder does not start ({error})"
         if refusal:
             self._close()
             raise SessionError(refusal)

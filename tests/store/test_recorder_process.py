@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
+import psutil
 import pytest
 
 from flowrec.core import NS_PER_S, OperatorEvent, SessionError
@@ -147,6 +148,14 @@ def test_what_can_not_be_made_is_refused_before_the_run_and_a_discarded_run_leav
     writer.write(TICKS[0])
     writer.discard()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recorder_that_ends_at_its_start_is_told_and_leaves_no_memory_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_process, "MODULE", "flowrec.core")  # a package, which is no program
+    before = psutil.Process().num_fds()
+    with pytest.raises(SessionError, match=r"x\.mcap: its recorder does not start .*exit status 1"):
+        SessionWriter(tmp_path / "x.mcap", HEADER, OWN)
+    assert psutil.Process().num_fds() == before
 
 
 RUN = """
