@@ -85,7 +85,7 @@ class Measuring(Protocol):
 
 @runtime_checkable
 class Tried(Protocol):
-    """A rig whose images can be had before a run, to measure whether the machine holds them."""
+    """A rig whose images can be had before a run, to measure whether the machine keeps up with them."""
 
     def tried(self) -> Generator[Inputs]:
         """The inputs of a run that gives no command, as often as asked; once connected, before the rig is entered."""

@@ -13,8 +13,7 @@ from .replay_figures import (
     CommandDifference as CommandDifference, ReplayFiles as ReplayFiles, ReplayPair as ReplayPair,
     before_after as before_after,
 )
-from .stream_inputs import StreamInputs as StreamInputs
-from .streams import Streams as Streams
+from .stream_inputs import StreamInputs as StreamInputs, Streams as Streams
 from .watchdog import Watchdog as Watchdog
 from .worker_process import ProcessWorker as ProcessWorker
 from .workers import (

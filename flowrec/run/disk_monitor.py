@@ -87,13 +87,14 @@ class DiskMonitor:
     def sample(self) -> bool:
         """Measure the free space once; True if it is below the floor."""
         try:
-            self._left = self._free(self._folder)
+            left = self._free(self._folder)
         except OSError:
             self._left = None  # the writer will get the error
             return False
         self._samples.append((self._clock_s(), self._written()))
-        if self._floor_gb > 0.0 and self._left < self._floor_gb * _GB:
-            self._low(f"disk floor: {self._left / _GB:.2g} GB left on {self._folder}")
+        self._left = left  # after the sample: another thread may ask for the text
+        if self._floor_gb > 0.0 and left < self._floor_gb * _GB:
+            self._low(f"disk floor: {left / _GB:.2g} GB left on {self._folder}")
             return True
         return False
 

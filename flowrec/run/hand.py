@@ -19,8 +19,8 @@ import numpy as np
 
 from flowrec.core import Floats, Hand
 
-# Pages send 50 samples a second: of seven in a row none has come, more than a busy browser or a tunnel delays. A robot
-# at 0.5 mm/s moves 75 um in this time.
+# Pages send 50 samples a second, so seven in a row are missing by then; a busy browser or a tunnel delays them less. A
+# robot at 0.5 mm/s moves 75 um in this time.
 SILENCE_S = 0.15
 DEVICES = ("gamepad", "keys")
 _LONGEST = 1.0 + 1e-6  # of the share

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from flowrec.run.control import RunControl
-from flowrec.run.operator_commands import BY_KEY, COMMANDS, LONGEST_NOTE
+from flowrec.run.operator_commands import BY_KEY, COMMANDS, LONGEST_NOTE, NOTE
 
 assert sys.platform != "win32"  # there is no termios
 
@@ -52,7 +52,7 @@ class Keyboard:
         command = BY_KEY.get(character)
         if command is None:
             return
-        if command.name == "note":
+        if command.name == NOTE:
             self.note = ""
         else:
             command.give(self._control, "", character)
@@ -60,7 +60,7 @@ class Keyboard:
     def _edit_note(self, note: str, character: str) -> None:
         if character in _ENTER:
             self.note = None
-            COMMANDS["note"].give(self._control, note, "n")
+            COMMANDS[NOTE].give(self._control, note, "n")
         elif character == _ESCAPE:
             self.note = None
         elif character in _RUBOUT:

@@ -31,7 +31,7 @@ class OperatorCommand:
 
 
 def _note(control: RunControl, text: str, _by: str) -> bool:
-    return not text.strip() or control.request(Action.NOTE, text.strip()[:LONGEST_NOTE])
+    return not text.strip() or control.request(Action.NOTE, text.strip())
 
 
 COMMANDS = {

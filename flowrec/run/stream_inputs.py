@@ -1,12 +1,14 @@
-"""The streams of a run as its inputs: at each tick the samples that have come since the one before, as one message.
+"""Inputs of a run from other programs and devices: samples of streams, and messages of extra topics.
 
-The stamps of samples are on the session clock. In real time this is the host's monotonic clock from the rig's stamp 0
-on; what a simulated rig measures has its stamps from the rig.
+A tick has the samples of all streams ([streams.NAME]) that have come since the tick before, as one message. Their
+stamps are on the session clock. In real time this is the host's monotonic clock from the rig's stamp 0 on; what a
+simulated rig measures has its stamps from the rig.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,9 +45,10 @@ from flowrec.rigs import (
 )
 from flowrec.run.control import RunControl
 from flowrec.run.stream_reader import StreamReader
-from flowrec.stages import STREAM_KINDS, Inputs, StreamSettings
+from flowrec.stages import STREAM_KINDS, ExtraRow, Inputs, StreamSettings
 
 _STATED_NS = NS_PER_S  # from one message with the state of the streams to the next, if only counts have changed
+_JOIN_S = 1.0
 
 
 @dataclass(slots=True)
@@ -262,3 +265,62 @@ def stream_of(name: str, settings: StreamSettings, rig: Rig, *, realtime: bool) 
         raise UsageError(f"streams.{name}.device: the kind {settings.kind!r} has no settings of its own; leave it out")
     stream: SampleStream = kind.of(name, settings)
     return stream
+
+
+class Streams:
+    """Messages of extra topics from other programs and devices, read while it is entered as a context.
+
+    Each topic is read in a thread of its own, so that the loop waits for none. A tick takes the latest message of a
+    topic; the message gets the stamp of that tick.
+
+    Parameters
+    ----------
+    rows : the extra topics of the run; those whose row has `stream` are read.
+    tell : called with one line if a stream fails or yields what is no message of its topic; the run goes on without it.
+    """
+
+    def __init__(self, rows: Iterable[ExtraRow], tell: Callable[[str], None]) -> None:
+        self._rows = [row for row in rows if callable(getattr(row.settings, "stream", None))]
+        self._tell = tell
+        self._latest: dict[str, Any] = {}  # messages by path
+        self._changed = threading.Lock()
+        self._closing = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._read, args=(row,), name=f"stream {row.topic.path}", daemon=True)
+            for row in self._rows
+        ]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._closing.set()
+        for thread in self._threads:
+            thread.join(_JOIN_S)  # a thread that still waits for its device ends with the process
+
+    def join(self, arriving: Iterator[Inputs]) -> Iterator[Inputs]:
+        """The inputs with the messages that have come since the last ones."""
+        for inputs in arriving:
+            if not self._latest:
+                yield inputs
+                continue
+            with self._changed:
+                taken, self._latest = self._latest, {}
+            new = {path: replace(message, stamp_ns=inputs.stamp_ns) for path, message in taken.items()}
+            yield replace(inputs, extra={**inputs.extra, **new})
+
+    def _read(self, row: ExtraRow) -> None:
+        path, kind = row.topic.path, row.topic.type
+        try:
+            for message in row.settings.stream():
+                if type(message) is not kind:
+                    raise TypeError(f"a {type(message).__name__} where a {kind.__name__} belongs")
+                with self._changed:
+                    self._latest[path] = message
+                if self._closing.is_set():
+                    return
+        except Exception as error:  # noqa: BLE001 - the code of others; it is told
+            why = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+            self._tell(f"{path}: its stream has failed ({why}); the run goes on without it")

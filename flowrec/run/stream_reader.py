@@ -2,7 +2,7 @@
 
 - The queue is bounded; of samples that the loop does not take the oldest are lost, and counted.
 - A stamp a tenth of a second before its predecessor, or in the future, is a step of the sender's clock. From there on
-  the stamps are shifted so that the samples are as old on arrival as before the step. Smaller steps pass.
+  the stamps are shifted so that the samples are as old on arrival as before the step. Smaller steps stay.
 - A gap in the stamps of a regular stream counts as missing samples, less those that then come closer together.
 - A sender that has ended is looked for again.
 """
@@ -113,13 +113,16 @@ class StreamReader:
 
     def start(self) -> None:
         """Begin to queue what comes from now on."""
-        if self._open and not self._stream.polled:
-            end_s = time.monotonic() + _DRAIN_S
-            while self._stream.read(0.0) is not None and time.monotonic() < end_s:
+        if self._stream.polled:
+            return
+        end_s = time.monotonic() + _DRAIN_S
+        try:
+            while self._open and self._stream.read(0.0) is not None and time.monotonic() < end_s:
                 pass  # of the time before the run
-        if not self._stream.polled:
-            self._thread = threading.Thread(target=self._read, name=f"stream {self.name}", daemon=True)
-            self._thread.start()
+        except Exception as error:  # noqa: BLE001 - the code of others; it is told
+            self._lose_sender(error)
+        self._thread = threading.Thread(target=self._read, name=f"stream {self.name}", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
         """Stop reading; a stream that does not return is left behind."""
@@ -170,12 +173,13 @@ class StreamReader:
                     self._accept(chunk)
                     self._closing.wait(max(0.0, gathered_s + _GATHER_S - time.monotonic()))
                     gathered_s = time.monotonic()
-            except NoStreamError as error:
-                self._lose_sender(str(error))
             except Exception as error:  # noqa: BLE001 - the code of others; it is told
-                self._lose_sender(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}")
+                self._lose_sender(error)
 
-    def _lose_sender(self, why: str) -> None:
+    def _lose_sender(self, error: Exception) -> None:
+        why = str(error)
+        if not isinstance(error, NoStreamError):
+            why = f"{type(error).__name__}: {why.partition(chr(10))[0]}"
         self._tell(f"streams.{self.name}: {why}; it is looked for again")
         self._stream.close()
         self._open = False

@@ -3,7 +3,7 @@
 A row is the frozen dataclass of its settings, section [NAME] of the configuration. Its class attribute `topic` declares
 the topic: path, source, tolerances, message type. Of Source.STAGE it has the method `step(last, tick)`, which returns
 the message of this tick, the previous one if nothing is due, or None; it is as memoryless as our stages. Of Source.RIG
-it may have `stream()`, which yields messages while the run goes on (run/streams.py).
+it may have `stream()`, which yields messages while the run goes on (run/stream_inputs.py).
 """
 
 from __future__ import annotations

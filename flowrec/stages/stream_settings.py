@@ -21,7 +21,7 @@ STREAM_KINDS = Methods(
     Method(LOG, "flowrec.rigs.streams.log:LogStream", "what a program of Python gives to flowrec.RunLog.log"),
     Method(
         SIMULATED_STREAM,
-        "flowrec.rigs.simulated.pump_sensor:PumpSensor",
+        "flowrec.rigs.simulated.pump:PumpSensor",
         "a flow sensor at the simulated pump",
         needs=("rig",),
     ),

@@ -22,13 +22,13 @@ from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.lookup import is_copy
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, Record, SealedChunk, records_in
 from flowrec.store.mcap_writer import McapWriter
-from flowrec.store.older_files import FORMER_RECORDS
 from flowrec.store.scan import Scan
 from flowrec.store.session_metadata import DIGEST, OUTCOME
 from flowrec.store.write_queue import Counters
 
 _MESSAGE_BYTES = RECORD_HEAD.size + MESSAGE_HEAD.size  # of a record besides its payload
-_ANEW = FORMER_RECORDS | {OUTCOME, DIGEST}  # records of which the new file gets its own, or none
+# Records of which the new file gets its own, or none: the last one is of older files, and not written any more.
+_ANEW = frozenset({OUTCOME, DIGEST, "flowrec.view"})
 _COUNTED = ("ticks", "dropped_frames")
 
 

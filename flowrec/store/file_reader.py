@@ -65,7 +65,7 @@ class FileReader(SessionContents):
     def announce(self, start_ns: int, fields: Collection[str], end_ns: int | None = None) -> None:
         """Announce that the state before a time and then the messages from it on are read: one round trip for a URL.
 
-        All messages before `end_ns`, or only the first ones where it is not known.
+        Announced are all messages before `end_ns`, or only the first ones where `end_ns` is None.
         """
         channels = self._channels_of(fields)
         before = _likely(self._chunks_until(start_ns - 1, channels), channels, start_ns - 1)

@@ -49,7 +49,7 @@ Piece = tuple[int, bytes]  # offset in the file, and the bytes from there on
 _PREFIX = "gathered/"
 _MEDIA_TYPE = "application/octet-stream"
 _PIECE_BYTES = 32 << 20  # of one attachment, which readers of other programs hold in memory
-_IMAGES_BYTES, _IMAGES_SHARE = 1 << 20, 4  # fewer images, or few beside the state, are no obstacle
+_IMAGES_BYTES, _IMAGES_SHARE = 1 << 20, 4  # with fewer images, or few beside the state, nothing is copied
 _OF_IMAGES = "lossless"  # in the metadata of the images' channel alone
 _COMPLEMENT = bytes(255 - value for value in range(256))
 

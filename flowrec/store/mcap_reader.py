@@ -58,7 +58,7 @@ _FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
 _AT_ONCE_BYTES, _WINDOW_LIMIT_BYTES = 8 << 20, 8 << 20
 _HEADER_LIMIT_BYTES = 1 << 16
 _SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
-# What is read in vain between copies, and between images whose state has copies, instead of one more request.
+# Longest gap that is read in vain to save a request: between copies, and between images whose state has copies.
 _COPIES_GAP_BYTES, _IMAGES_GAP_BYTES = 1 << 20, 256 << 10
 _SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
 _PARSED: dict[Opcode, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}

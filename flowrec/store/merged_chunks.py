@@ -14,7 +14,8 @@ from mcap.records import ChunkIndex
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
 from flowrec.store.mcap_reader import McapReader
 
-# Decompressed before they are asked for. The number grows as they are read: who reads little fetches little.
+# Chunks that are decompressed before they are asked for. Their number grows while they are read, so that a caller who
+# needs only the first messages fetches little.
 _AHEAD_BYTES, _AHEAD_CHUNKS, AHEAD_AT_FIRST = 32 << 20, 48, 4
 _ANNOUNCED_BYTES = 16 << 20  # at a time, of what is wanted as a whole
 _THREADS = 2

@@ -57,10 +57,8 @@ class Parts(SegmentedRun):
         self._file.flush(wait=True)
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None:
-        last = self.open[-1]
-        last.counters.dropped_frames += int(outcome.get("dropped_frames", 0))  # before a recovery
         self._file.flush()
-        self._complete(self._file, outcome, last.counters)
+        self._complete(self._file, outcome, self.open[-1].counters)
         self._collect_finished(wait=True)
 
     def close(self, reason: str = "") -> None:

@@ -88,12 +88,12 @@ class RecorderThread:
         return self.run.dropped
 
     def prioritise(self) -> bool:
-        """Let it write in real time, behind a loop that has that priority too; whether it is allowed."""
+        """Give it a real-time priority below that of the loop; True if the system allows it."""
         native_id = self._thread.native_id
         return native_id is not None and prioritise_thread(native_id, Priority.WRITER)
 
     def wait(self, timeout_s: float | None) -> bool:
-        """Wait for the end of the recording; whether it has come in time."""
+        """Wait for the end of the recording; True if it has come in time."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
@@ -133,7 +133,7 @@ class RecorderProcess:
             self.queue.wake_by(self._child.process.stdin.fileno())
             refusal: str = self._child.receive()
         except ChildEndedError as error:
-            raise SessionError(f"{plan.path}: its recorder does not start ({error})") from error
+            refusal = f"{plan.path}: its recorder does not start ({error})"
         if refusal:
             self._close()
             raise SessionError(refusal)
@@ -146,11 +146,11 @@ class RecorderProcess:
         return self.queue.files_bytes
 
     def prioritise(self) -> bool:
-        """Let it write in real time, behind a loop that has that priority too; whether it is allowed."""
+        """Give it a real-time priority below that of the loop; True if the system allows it."""
         return prioritise_thread(self._child.process.pid, Priority.WRITER)
 
     def wait(self, timeout_s: float | None) -> bool:
-        """Wait for the end of the recording; whether it has come in time."""
+        """Wait for the end of the recording; True if it has come in time."""
         if timeout_s is not None:
             if not self._ended.wait(timeout_s):
                 return False

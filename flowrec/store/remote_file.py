@@ -28,8 +28,8 @@ from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout
 _END_BYTES, _HEAD_BYTES = 512 << 10, 256 << 10
 _AHEAD_BYTES = 64 << 20
 _GAP_BYTES, _JOINED_BYTES = 64 << 10, 16 << 20
-_BLOCK_BYTES = 4 << 20  # for who reads on
-_NEAR_BYTES = 1 << 20  # what is read so near before the known end is fetched up to it
+_BLOCK_BYTES = 4 << 20  # that are asked for at a time where one read begins at the end of the one before
+_NEAR_BYTES = 1 << 20  # a read that ends so near before the known end is extended up to that
 _REMEMBERED, _REMEMBERED_S = 64, 60.0  # openings, and for how long they hold
 _TOGETHER = 8  # objects that are opened at a time
 
@@ -200,17 +200,13 @@ class RemoteFile(Closing):
         return opened
 
     def _range(self, first: int, length: int) -> Answer:
-        answer = self._answer(self._object.requests, first, length)
-        self._refuse_other(answer, self._object.tail)
+        answer, before = self._answer(self._object.requests, first, length), self._object.tail
+        if (answer.version, answer.size) != (before.version, before.size):  # it is of another object
+            forget(self.path)
+            raise SessionError(f"{self.path}: was replaced while it was read; open it again")
         if (answer.first, len(answer.data)) != (first, length):
             raise SessionError(f"{self.path}: the server sent other bytes than those that were asked for")
         return answer
-
-    def _refuse_other(self, answer: Answer, before: Answer) -> None:
-        """Raise SessionError where an answer is not of the same object as one before."""
-        if (answer.version, answer.size) != (before.version, before.size):
-            forget(self.path)
-            raise SessionError(f"{self.path}: was replaced while it was read; open it again")
 
     def _answer(self, asked: ObjectRequests, first: int | None, length: int) -> Answer:
         answer = ask_repeatedly(

@@ -21,7 +21,7 @@ from typing import Self
 from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds, shell_word
 from flowrec.store.byte_source import is_there, open_bytes
 from flowrec.store.mcap_format import UnfinishedError
-from flowrec.store.session_metadata import Part, SessionMetadata
+from flowrec.store.session_metadata import Part, SessionMetadata, is_count
 from flowrec.store.session_path import UrlPath, session_path
 
 SESSION_SUFFIX = ".mcap"
@@ -220,7 +220,7 @@ class Run:
             outcome.pop("frames_windows", None)  # of the last part alone
             for key in _COUNTS:
                 counts = [file.outcome[key] for file in self.files if key in file.outcome]
-                if counts and all(text.isdecimal() and len(text) < 20 for text in counts):
+                if counts and all(map(is_count, counts)):
                     outcome[key] = str(sum(map(int, counts)))
         return outcome
 

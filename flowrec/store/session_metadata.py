@@ -1,11 +1,14 @@
 """The metadata of a session file: enough to list, describe and replay it, also where its messages can not be read.
 
-Light to import: no numpy, no schemas. channels.py adds what reading the messages needs.
+Light to import: no numpy, no schemas. channels.py adds what reading the messages needs. What older files state in other
+words is turned into today's where it is declared: the outcome here, settings that moved in stages/config.py. A field of
+a message, a setting or a fact of the head that came later has a default there, which means "as before".
 """
 
 from __future__ import annotations
 
 import functools
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +21,6 @@ from mcap.records import Attachment, Metadata, Statistics
 from flowrec.core import NS_PER_S, Closing, SessionError, __version__, nanoseconds, parse_toml
 from flowrec.store.mcap_format import ForeignError, Summary
 from flowrec.store.mcap_reader import McapReader
-from flowrec.store.older_files import outcome_of_today
 
 if TYPE_CHECKING:
     from flowrec.physics import Chip
@@ -45,6 +47,9 @@ _METADATA_LIMIT_BYTES = 16 << 20
 _ATTACHMENTS_LIMIT_BYTES = 256 << 20
 _SHOWN = 40  # characters of a version; int() refuses thousands of digits
 _DIGITS = 20  # more than a number of 64 bit has
+# Of the outcomes of older files: sentence on the times of the ticks; a second count of dropped images.
+_REPEATED = ("duration", "frames_dropped")
+_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \((\w{1,20})\)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,6 +295,27 @@ class SessionMetadata(Closing):
         return dict(found)
 
 
+def outcome_of_today(recorded: Mapping[str, str]) -> dict[str, str]:
+    """The outcome of a file with the keys and values of today's; other sentences of the first release stay text.
+
+    The first release counted dropped images under two names, of which the larger count is complete.
+    """
+    found = {key: text for key, text in recorded.items() if key not in _REPEATED}
+    counts = [recorded[key] for key in ("dropped_frames", "frames_dropped") if key in recorded]
+    if "frames_dropped" in recorded and all(map(is_count, counts)):
+        found["dropped_frames"] = str(max(map(int, counts)))
+    for name in ("assumed", "refined"):
+        stated = _FLOW_ERROR.fullmatch(found.get(f"{name}_flow_error", ""))
+        if stated is not None:
+            found |= {f"{name}_flow_error": repr(float(stated[1]) / 100), f"{name}_method": stated[2]}
+    return found
+
+
+def is_count(text: str) -> bool:
+    """True for the digits of a number that a file of flowrec can have."""
+    return text.isdecimal() and len(text) < _DIGITS
+
+
 def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
     """Position of a file in its run, from its metadata records.
 
@@ -299,8 +325,8 @@ def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
     if facts is None:
         return None
     number, kind, keyframe = facts.get("number", ""), facts.get("kind", ""), facts.get("carried_ns", "")
-    are_numbers = number.isdecimal() and (keyframe.isdecimal() or not keyframe)
-    if kind not in ("part", "snapshot") or not are_numbers or max(len(number), len(keyframe)) >= _DIGITS:
+    are_numbers = is_count(number) and (is_count(keyframe) or not keyframe)
+    if kind not in ("part", "snapshot") or not are_numbers:
         what = f"{kind[:40]!r} {number[:40]!r}, carried from {keyframe[:40]!r}"
         raise ValueError(f"a record of a part with invalid values: {what}")
     return Part(facts.get("run", ""), int(number), kind, int(keyframe) if keyframe else None, facts.get("why", ""))

@@ -23,7 +23,10 @@ from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader, SessionMetadata
 from flowrec.store.writer import SessionWriter
 
-_LOSSLESS = "zstd"  # for images of a lossy encoding: once more through it they would be others
+_LOSSLESS = "zstd"  # for images of a lossy encoding, which would change them once more
+_QUEUE_S = 4.0  # of images, that wait where the disk stalls
+_LARGEST_PICTURE_BYTES = 50_000_000
+_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 64_000_000, 1_250_000_000
 
 
 def cut_session(reader: SessionReader, output: Output, from_ns: int, to_ns: int) -> int:
@@ -58,11 +61,6 @@ def cut_session(reader: SessionReader, output: Output, from_ns: int, to_ns: int)
             count += 1
         writer.close({"outcome": Outcome.SNAPSHOT, "note": f"cut from {why}"})
     return count
-
-
-_QUEUE_S = 4.0  # of images, that wait where the disk stalls
-_LARGEST_PICTURE_BYTES = 50_000_000
-_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 64_000_000, 1_250_000_000
 
 
 def session_writer(

@@ -26,6 +26,7 @@ _STATE_BYTES = 160 << 20  # twice a tick of 80 MB, which always has room in an e
 # may wait is put in: it may become the first one of the next part.
 _IMAGE_BYTES = 64 << 20
 _MARGIN_BYTES = 1 << 20
+_END_BYTES = 1 << 18  # of the ring of the state that no entry takes, so that the end of the run has room there
 _POLL_S = 0.0005
 _PARENT_S = 1.0  # between two looks whether the run is still there
 _HEAD = struct.Struct("<I")
@@ -114,7 +115,8 @@ class SharedQueue:
         """
         if self._abandoned:
             return
-        if not self._state.put(_record_of(entry)):
+        record = _record_of(entry)
+        if not (self._state.has_room(sum(map(len, record)) + _END_BYTES) and self._state.put(record)):
             behind_mb, tick_mb = self._state.used_bytes / 1e6, entry.nbytes / 1e6
             found = f"the recorder is {behind_mb:.0f} MB behind, and a tick of {tick_mb:.1f} MB has no room"
             raise SessionError(f"{found}: is its disk hung?")
@@ -144,9 +146,8 @@ class SharedQueue:
         self._abandoned = True
 
     def _wake_up(self) -> None:
-        with contextlib.suppress(
-            BlockingIOError, BrokenPipeError
-        ):  # it is awake; it has ended, which is told elsewhere
+        # The recorder is awake already; or it has ended, which recorder_process.py tells.
+        with contextlib.suppress(BlockingIOError, BrokenPipeError):
             os.write(self._wake, b"\0")
 
 

@@ -128,7 +128,7 @@ class SessionWriter:
         return self._recorder.remarks
 
     def prioritise(self) -> bool:
-        """Let the recorder write in real time, behind a loop that has that priority too; whether it is allowed."""
+        """Give the recorder a real-time priority below that of the loop; True if the system allows it."""
         return self._recorder.prioritise()
 
     def write(self, tick: Tick) -> None:

@@ -25,6 +25,7 @@ from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, TRACER,
 _LEAST_WIDTH_PX = 480  # smaller images are enlarged by a whole factor, so that words and lines are readable
 _LETTER_PX = 13.0
 _LINE_PX = 1.6
+_THIN_PX = 0.8 * _LINE_PX  # of arrows and tracers
 _SPARSER = 1.9  # distance of the arrows over that of the viewer's map, which is larger
 _TRAIL_STEP_PX = 3.0  # between two points of the trail: its lines are thicker than the viewer's
 _RING_PX = 3.0  # between the robot and its ring
@@ -52,7 +53,9 @@ class Overlay:
         self.size_px = width + width % 2, height + height % 2
         self._scene = scene
         self._canvas = np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
+        self._line_px = _LINE_PX * self._unit
         self._robot_px = self.zoom * scene.length_px(scene.robot.radius_um)
+        self._ring_px = self._robot_px + _RING_PX * self._unit
         self._grid = _sparser(*arrow_grid(scene))
         self._to_image: Floats = np.eye(2, 3)  # by the refined registration and the shift
         self._trail = Trail(_TRAIL_STEP_PX * self._unit)
@@ -91,6 +94,10 @@ class Overlay:
         """Points (..., 2) of the picture plane to pixels of this picture."""
         return self.zoom * (plane @ self._to_image[:, :2].T + self._to_image[:, 2]) - 0.5
 
+    def _seen_px(self, measured_um: Floats) -> Floats:
+        """Measured points (..., 2) as pixels of this picture, with the shift of its image."""
+        return self.zoom * (self._scene.to_plane(measured_um) + np.array(shift_px(self._tick.shift))) - 0.5
+
     def _redraw(self, tick: Tick) -> Layer:
         """Draw what does not move: flow, route, goal, and the legend."""
         layer, field = Layer((self._height, self._width)), tick.field
@@ -99,11 +106,11 @@ class Overlay:
         path = self._to_px(self._scene.to_plane(way_of(tick.route)))
         has_route = len(path) > 0 and drawable(path)
         if has_route:
-            layer.lines([path], (), ROUTE, _LINE_PX * self._unit)
+            layer.lines([path], (), ROUTE, self._line_px)
         goal = goal_of(tick.mission)
         if goal is not None:
             centre, reach = self._to_px(self._scene.to_plane(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
-            layer.lines([centre + reach * part for part in GOAL_SIGN], (), GOAL, _LINE_PX * self._unit)
+            layer.lines([centre + reach * part for part in GOAL_SIGN], (), GOAL, self._line_px)
         self._status_bar.set_legend(goal=goal is not None, route=has_route, tracers=tick.tracers is not None, flow=flow)
         return layer
 
@@ -119,12 +126,11 @@ class Overlay:
         along = vectors[known] @ self._to_image[:, :2].T
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         half = 0.5 * px_per_speed * np.minimum(speed[known], 1.2 * fastest)[:, None] * along
-        width_px = 0.8 * _LINE_PX * self._unit
+        width_px = _THIN_PX * self._unit
         layer.lines(*arrows(middle - half, middle + half, width_px), FLOW, width_px)
         return "refined flow" if refined else "assumed flow", round_below(fastest), px_per_speed
 
     def _draw_robot(self, picture: Picture, clean: Picture, estimate: Estimate) -> None:
-        unit = self._unit
         # Counted at the centres of pixels, of a picture without shift.
         centre = self.zoom * self._scene.to_plane(estimate.position_um) - 0.5
         if not drawable(centre):
@@ -134,25 +140,22 @@ class Overlay:
         off = self.zoom * np.array(shift_px(self._tick.shift))
         way = np.array([*trail, centre]) + off
         centre = centre + off
-        draw_outline(picture, way, colour, _LINE_PX * unit)
-        ring = self._robot_px + _RING_PX * unit
-        restore(picture, clean, centre, ring)
-        draw_outline(picture, centre + ring * CIRCLE, colour, _LINE_PX * unit)
+        draw_outline(picture, way, colour, self._line_px)
+        restore(picture, clean, centre, self._ring_px)
+        draw_outline(picture, centre + self._ring_px * CIRCLE, colour, self._line_px)
 
     def _draw_tracers(self, picture: Picture, tracers: Tracers) -> None:
         """A line from each tracer that moves to where it will be soon."""
-        off = np.array(shift_px(self._tick.shift))
-        ways = [self.zoom * (self._scene.to_plane(ends) + off) - 0.5 for ends in tracer_ways_um(tracers)]
-        for way in np.stack(ways, axis=1):
+        for way in np.stack([self._seen_px(ends) for ends in tracer_ways_um(tracers)], axis=1):
             if drawable(way):
-                draw_outline(picture, way, TRACER, 0.8 * _LINE_PX * self._unit)
+                draw_outline(picture, way, TRACER, _THIN_PX * self._unit)
 
     def _draw_other(self, picture: Picture, estimate: Estimate, colour: colours.Rgb) -> None:
         """The ring of a robot that is not the mission's."""
-        centre = self.zoom * (self._scene.to_plane(estimate.position_um) + np.array(shift_px(self._tick.shift))) - 0.5
+        centre = self._seen_px(estimate.position_um)
         if drawable(centre):
-            ring = centre + (self._robot_px + _RING_PX * self._unit) * CIRCLE
-            draw_outline(picture, ring, colour if estimate.seen else colours.PALE, _LINE_PX * self._unit)
+            ring = centre + self._ring_px * CIRCLE
+            draw_outline(picture, ring, colour if estimate.seen else colours.PALE, self._line_px)
 
 
 def _content_key(tick: Tick) -> tuple[object, ...]:

@@ -12,7 +12,7 @@ import pytest
 
 from flowrec.core import Value, of_text, verdict_lines, way_text, with_micro
 from flowrec.store import Session, SessionReader
-from flowrec.store.older_files import outcome_of_today
+from flowrec.store.session_metadata import outcome_of_today
 from tests.conftest import run
 from tests.short_missions import SMALL
 

@@ -23,7 +23,7 @@ import numpy as np
 from flowrec.core import ChipError
 from flowrec.measure.picture_registration import register
 from flowrec.physics import Calibration, Chip, ChipSettings, load_chip
-from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.microscope import DrawnRobot, Microscope
 from flowrec.stages import CameraSettings, SimulatedImage
 from tests.physics.chip.looks import LOOKS, picture
 
@@ -99,7 +99,7 @@ def cases(seed: int, laid: list[np.ndarray]) -> Iterator[Case]:
                 camera = CameraSettings(*SIZE_PX)
                 seen = Microscope(chip.mask, chip.um_per_px, truth, camera, SimulatedImage(), number)
                 robot = np.array(truth.to_um((300.0, 200.0)))
-                image = seen.image(robot, 5 * truth.um_per_px, np.zeros(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+                image = seen.image([DrawnRobot(robot, 5 * truth.um_per_px)])
                 image = 255 - image if "inverted" in look else image
             yield Case(look, name, replace(chip, um_per_px=chip.um_per_px / fill), rescaled(truth, fill), image, number)
             number += 1

@@ -40,7 +40,7 @@ from flowrec.physics import (
     without_pockets,
 )
 from flowrec.physics.chip.openings import check_openings
-from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.microscope import DrawnRobot, Microscope
 from flowrec.stages import CameraSettings, SimulatedImage
 from tests.physics.chip.looks import LOOKS, Look, picture
 
@@ -112,7 +112,7 @@ def cases(seed: int, longest_px: int, wanted: Callable[[int], bool] = lambda _: 
                 settings = CameraSettings(*size)
                 scope = Microscope(chip.mask, chip.um_per_px, camera, settings, SimulatedImage(), seed + number)
                 robot = np.array(camera.to_um((0.4 * width, 0.5 * height)))
-                image = scope.image(robot, 5 * um, np.zeros(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+                image = scope.image([DrawnRobot(robot, 5 * um)])
                 image = 255 - image if "inverted" in look else image
             if look == "text":
                 top = int(image.max())

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import Truth
+from flowrec.core import RigError, Truth
+from flowrec.physics import median_width_um
 from flowrec.stages import robot_topic
-from tests.rigs.test_simulated import EXACT, MIDDLE, NOISELESS, command, fly, rig_with, steady
+from tests.rigs.test_simulated import EXACT, MIDDLE, NOISELESS, ROBOT, STRAIGHT, command, fly, rig_with, steady
 
 FLOW = steady(120.0)
 
@@ -65,6 +66,13 @@ def test_contacts_with_walls_are_counted_for_each() -> None:
     up = command(12.0, -np.pi / 2)
     seen = fly(rig_with(simulated=replace(EXACT, seed=7, robots=4), duration_s=2.0), {0: up})
     assert all(told.contacts >= 1 and told.clearance_um > -1.0 for told in seen[-1].extra.values())
+
+
+def test_a_chip_without_room_for_another_robot_is_refused_in_one_line() -> None:
+    wide = replace(ROBOT, radius_um=0.4 * float(median_width_um(STRAIGHT)))
+    rig = rig_with(flow=FLOW, simulated=replace(EXACT, robots=2), robot=wide)
+    with pytest.raises(RigError, match=r"no room for another robot; set simulated\.robots = 1"):
+        fly(rig)
 
 
 @pytest.mark.parametrize("robots", [1, 2])

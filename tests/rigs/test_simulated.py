@@ -30,10 +30,10 @@ def steady(vx, vy=0.0):
     return FlowField(0, 0, "known", 20.0, velocity, np.zeros(STRAIGHT.mask.shape), None, values, 1.0, 1000.0, "")
 
 
-def rig_with(start=(1000.0, MIDDLE), flow=None, simulated=EXACT, camera=CAMERA, duration_s=1.0, **more):
+def rig_with(start=(1000.0, MIDDLE), flow=None, simulated=EXACT, camera=CAMERA, duration_s=1.0, robot=ROBOT, **more):
     calibration = Calibration(STRAIGHT.size_um[0] / camera.width_px)
     flow = steady(0.0) if flow is None else flow
-    return SimulatedRig(STRAIGHT, ROBOT, calibration, camera, simulated, start, duration_s, true_field=flow, **more)
+    return SimulatedRig(STRAIGHT, robot, calibration, camera, simulated, start, duration_s, true_field=flow, **more)
 
 
 def command(frequency_hz, heading_rad=0.0, amplitude_mt=5.0):

@@ -183,6 +183,18 @@ def test_below_its_floor_the_disk_ends_the_run_once_and_says_how_long_it_will_la
     refuse_below(0.0, tmp_path, lambda _folder: 0)
 
 
+def test_the_disk_has_a_text_also_while_it_is_measured_for_the_first_time(tmp_path: Path) -> None:
+    texts: list[str] = []
+
+    def written() -> int:  # as long as this takes, another thread may ask
+        texts.append(watch.text)
+        return 0
+
+    watch = DiskMonitor(tmp_path, written, 0.0, texts.append, lambda _folder: 5_000_000_000)
+    watch.sample()
+    assert [*texts, watch.text] == ["disk ?", "disk 5 GB left"]
+
+
 def test_a_disk_that_runs_low_ends_a_run_in_good_order_with_status_3(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -259,6 +259,31 @@ def test_a_sender_that_was_restarted_has_a_clock_of_its_own() -> None:
     assert stamps[100:] == (EPOCH_NS + PERIOD_NS * np.arange(100, 150)).tolist()
 
 
+def test_a_sender_that_ends_before_the_run_begins_is_looked_for_again() -> None:
+    class Ended(Scripted):
+        polled = False
+        opened = 0
+
+        def open(self) -> StreamHead:
+            self.opened += 1
+            return super().open()
+
+        def read(self, timeout_s: float) -> Chunk | None:
+            if self.opened == 1:
+                raise NoStreamError("its outlet has ended")
+            return super().read(timeout_s)
+
+    stream = Ended()
+    reader, told = reader_of(stream)
+    reader.start()
+    end_s = time.monotonic() + 10.0
+    while not reader.state.restarts and time.monotonic() < end_s:
+        time.sleep(0.01)
+    reader.close()
+    assert told == ["streams.pump: its outlet has ended; it is looked for again"]
+    assert reader.state.restarts == 1 and not reader.state.gone
+
+
 def test_values_of_a_program_are_a_stream_with_a_channel_a_name() -> None:
     run = RunLog()
     run.log("pump/pressure", EPOCH_NS, 1.0, "Pa")  # before the run has begun

@@ -9,9 +9,11 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
+import psutil
 import pytest
 
 from flowrec.core import NS_PER_S, OperatorEvent, SessionError
@@ -26,6 +28,7 @@ from flowrec.store import (
     shared_queue,
 )
 from flowrec.store.session_file import Snapshot, Split
+from flowrec.store.write_queue import End, Entry
 from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 from tests.store.test_chunk_copies import messages_of
@@ -79,6 +82,7 @@ def test_parts_snapshots_and_declared_topics_pass_through_a_process(tmp_path):
 def test_a_part_begins_with_the_last_image_before_it_whatever_its_memory_is_used_for(tmp_path, monkeypatch, block):
     monkeypatch.setattr(shared_queue, "_STATE_BYTES" if block else "_IMAGE_BYTES", 50_000)
     monkeypatch.setattr(shared_queue, "_MARGIN_BYTES", 1000)
+    monkeypatch.setattr(shared_queue, "_END_BYTES", 100)
     options = replace(OWN, block=block, files=Split(seconds=0.2), queue_limit_bytes=1 << 20)
     with SessionWriter(tmp_path / "p.mcap", HEADER, options) as writer:
         for tick in ticks_of(200):  # faster than they are written: the memory is always full
@@ -110,6 +114,22 @@ def test_whoever_waits_for_a_flush_goes_on_at_the_very_stamp_that_was_flushed():
     os.close(write)
 
 
+def test_a_run_whose_recorder_stands_still_until_nothing_has_room_still_tells_its_end(monkeypatch):
+    monkeypatch.setattr(shared_queue, "_STATE_BYTES", 1 << 20)
+    queue, (read, write) = shared_queue.SharedQueue(1 << 20, images=False), os.pipe()
+    queue.wake_by(write)
+    recorder = shared_queue.QueueReader(queue.handles, read)
+    with pytest.raises(SessionError, match="behind"):
+        deque(map(queue.put, itertools.repeat(Entry(0, {}, 0))), maxlen=0)
+    end = End({"outcome": "failed", "note": 2000 * "x"})
+    queue.close(end)
+    while (entry := recorder.take(0.0)) is not None:
+        recorder.release(entry)
+    assert recorder.end == end
+    os.close(read)
+    os.close(write)
+
+
 @pytest.mark.parametrize("own", [True, False])
 def test_an_image_larger_than_what_may_wait_is_recorded_where_nothing_waits(tmp_path, own):
     options = WriterOptions(own_process=own, frames="raw", queue_limit_bytes=1000)
@@ -128,6 +148,14 @@ def test_what_can_not_be_made_is_refused_before_the_run_and_a_discarded_run_leav
     writer.write(TICKS[0])
     writer.discard()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recorder_that_ends_at_its_start_is_told_and_leaves_no_memory_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_process, "MODULE", "flowrec.core")  # a package, which is no program
+    before = psutil.Process().num_fds()
+    with pytest.raises(SessionError, match=r"x\.mcap: its recorder does not start .*exit status 1"):
+        SessionWriter(tmp_path / "x.mcap", HEADER, OWN)
+    assert psutil.Process().num_fds() == before
 
 
 RUN = """

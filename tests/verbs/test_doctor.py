@@ -36,7 +36,6 @@ MEASURED = (
 SEEN = camera.CameraProbe(
     CameraInfo("Maker Model", "7", 640, 512, 8, 20.0, pixel_format="Mono8"),
     rate_hz=20.0,
-    delivered_hz=20.0,
     losses=CameraLosses(0, 1000, 1000, 0, 0, 0, 0, 0, 0),
     clock_slope=1.0,
     arrival_ms=51.0,

@@ -31,7 +31,7 @@ from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.stages import Pipeline, ResolvedConfig
 
-_LATE_NS = 5_000_000  # after a moment its samples are in the file
+_LATE_NS = 5_000_000  # so long after a moment its samples are in the file
 _PIECE_NS = 25_000_000  # during which the robot rolls straight; shorter ones show the delays of a board as fast turns
 _KEPT_NS = NS_PER_S
 _BEGIN_S = 60.0  # for the first image

@@ -1,4 +1,4 @@
-"""The rig of a movie: its images, and of a log what the coils did. Nothing is sent.
+"""The rig of a movie: it plays the images, and reads in a log what the coils did. It sends no command.
 
 `Applied` at an image holds what acts on the robot: what the log says of the time robot.delay_s before it, or, of the
 tables of a session, of that time.

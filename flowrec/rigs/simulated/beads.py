@@ -123,7 +123,7 @@ class Beads(Carried):
 
 
 def profile_exponent(depth_over_width: float) -> float:
-    """N of the profile over the depth."""
+    """Exponent n of the profile over the depth, see above."""
     if depth_over_width <= 1.0:
         return 2.0 + 0.3 * max(depth_over_width - 1.0 / 3.0, 0.0)
     return 1.7 + 0.5 * depth_over_width**1.4

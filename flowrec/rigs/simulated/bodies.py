@@ -15,7 +15,7 @@ import numpy as np
 
 from flowrec.core import UM_PER_M, Bools, Floats, Floats32, FlowField, bilinear, compiled
 from flowrec.physics import Chip, Robot, sample, velocity_at, walls_of
-from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Hindrance, hindered_velocity
+from flowrec.rigs.simulated.hindrance import FAXEN, NO_HINDRANCE, Around, Hindrance, hindered_velocity
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.world import true_pump
 from flowrec.stages import Simulated
@@ -26,61 +26,33 @@ _BOLTZMANN_J_K = 1.380649e-23
 
 
 @compiled
-def _moves(
-    x: float,
-    y: float,
-    own_x: float,
-    own_y: float,
-    velocity: Floats32,
-    wall_px: Floats32,
-    strength: float,
-    clearance: Floats32,
-    um_per_px: float,
-    radius: float,
-    hindrance: float,
-    walls: Floats32,
-) -> tuple[float, float]:
+def _moves(x: float, y: float, own_x: float, own_y: float, around: Around) -> tuple[float, float]:
     """Velocity of the robot at (x, y) um."""
-    if hindrance == 0.0:
-        vx, vy = velocity_at(velocity, wall_px, x / um_per_px, y / um_per_px)
+    px, strength = around.um_per_px, around.strength
+    if around.hindrance == 0.0:
+        vx, vy = velocity_at(around.velocity, around.wall_px, x / px, y / px)
         return own_x + strength * vx, own_y + strength * vy
     flow = np.empty((4, 2))
-    away = FAXEN * radius
+    away = FAXEN * around.radius
     for n, (dx, dy) in enumerate(((away, 0.0), (-away, 0.0), (0.0, away), (0.0, -away))):
-        vx, vy = velocity_at(velocity, wall_px, (x + dx) / um_per_px, (y + dy) / um_per_px)
+        vx, vy = velocity_at(around.velocity, around.wall_px, (x + dx) / px, (y + dy) / px)
         flow[n, 0] = strength * vx
         flow[n, 1] = strength * vy
-    return hindered_velocity(x, y, own_x, own_y, flow, hindrance, clearance, walls, um_per_px, radius)
+    return hindered_velocity(x, y, own_x, own_y, flow, around)
 
 
 @compiled
 def _swim(
-    x: float,
-    y: float,
-    own_x: float,
-    own_y: float,
-    dt: float,
-    noise: Floats,
-    velocity: Floats32,
-    wall_px: Floats32,
-    strength: float,
-    clearance: Floats32,
-    um_per_px: float,
-    radius: float,
-    hindrance: float,
-    walls: Floats32,
+    x: float, y: float, own_x: float, own_y: float, dt: float, noise: Floats, around: Around
 ) -> tuple[float, float, int, float]:
     """Advance by len(noise) midpoint steps of dt. Returns x, y (um), steps that touched a wall, last clearance."""
+    clearance, um_per_px, radius = around.clearance, around.um_per_px, around.radius
     touched = 0
     free = 0.0
     for n in range(noise.shape[0]):
         # Midpoint rule in the flow, then the random walk.
-        wx, wy = _moves(x, y, own_x, own_y, velocity, wall_px, strength, clearance, um_per_px, radius, hindrance, walls)
-        mx = x + 0.5 * dt * wx
-        my = y + 0.5 * dt * wy
-        wx, wy = _moves(
-            mx, my, own_x, own_y, velocity, wall_px, strength, clearance, um_per_px, radius, hindrance, walls
-        )
+        wx, wy = _moves(x, y, own_x, own_y, around)
+        wx, wy = _moves(x + 0.5 * dt * wx, y + 0.5 * dt * wy, own_x, own_y, around)
         x += dt * wx + noise[n, 0]
         y += dt * wy + noise[n, 1]
         free = bilinear(clearance, x / um_per_px, y / um_per_px)
@@ -193,13 +165,7 @@ class Swimmer:
         self.gone = not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5)
 
     def _run(self, own_x: float, own_y: float, dt: float, noise: Floats) -> tuple[int, float]:
-        x, y, touched, free = _swim(
-            float(self.position_um[0]),
-            float(self.position_um[1]),
-            own_x,
-            own_y,
-            dt,
-            noise,
+        around = Around(
             self._field.velocity_um_s,
             walls_of(self._field),
             self._pump.strength(self._time_s - 0.5 * dt * len(noise)),
@@ -209,6 +175,8 @@ class Swimmer:
             self._hindrance.share,
             self._hindrance.walls,
         )
+        x, y = self.position_um.tolist()
+        x, y, touched, free = _swim(x, y, own_x, own_y, dt, noise, around)
         self.position_um = np.array([x, y])
         return touched, free
 

@@ -35,6 +35,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -92,25 +93,29 @@ def approach_mobility(gap: float) -> float:
     return gap / (gap + 1.0 / _STAGNATION)
 
 
+class Around(NamedTuple):
+    """Flow and walls around a robot of a radius in um."""
+
+    velocity: Floats32  # (h, w, 2) of the steady flow
+    wall_px: Floats32
+    strength: float  # of the flow now over the steady one
+    clearance: Floats32  # (h, w) from pixel centres to walls, um
+    um_per_px: float
+    radius: float
+    hindrance: float  # share of it, 0 to 1
+    walls: Floats32  # as of `walls_around`
+
+
 @compiled
 def hindered_velocity(
-    x: float,
-    y: float,
-    own_x: float,
-    own_y: float,
-    flow: Floats,
-    share: float,
-    clearance: Floats32,
-    walls: Floats32,
-    um_per_px: float,
-    radius: float,
+    x: float, y: float, own_x: float, own_y: float, flow: Floats, around: Around
 ) -> tuple[float, float]:
     """Velocity of the robot at (x, y) um: own motion and flow, with a share of the hindrance.
 
-    `flow` (4, 2) is the flow FAXEN radii to the right, left, below and above; `walls` as in `walls_around`; other
-    arguments as in bodies.py.
+    `flow` (4, 2) is the flow FAXEN radii to the right, left, below and above.
     """
-    i, j = x / um_per_px, y / um_per_px
+    share, clearance, walls, radius = around.hindrance, around.clearance, around.walls, around.radius
+    i, j = x / around.um_per_px, y / around.um_per_px
     near = bilinear(clearance, i, j)
     far = max(bilinear(walls[0], i, j) - near, near)
     near_gap, far_gap = near / radius - 1.0, far / radius - 1.0

@@ -26,7 +26,6 @@ from flowrec.physics import Calibration, clearance_um
 from flowrec.stages import CameraSettings, Optics, SimulatedImage
 
 _POOL = 1 << 20  # normal numbers drawn once; an image takes its noise from them at random offsets
-_DARKNESS = 0.8  # of the robot of the mission
 _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
 
 
@@ -109,8 +108,19 @@ class DrawnRobot(NamedTuple):
 
     position_um: Floats  # (2,)
     radius_um: float
-    velocity_um_s: Floats  # (2,)
-    darkness: float  # from 0 to 1
+    velocity_um_s: Floats = np.zeros(2)  # (2,)
+    darkness: float = 0.8  # from 0 to 1: this is that of the robot of the mission
+
+
+class Particles(NamedTuple):
+    """Particles in an image, n of them."""
+
+    points_um: Floats  # (n, 2)
+    radii_um: Floats  # (n,)
+    darkness: Floats  # (n,) from 0 to 1
+
+
+NO_PARTICLES = Particles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 class Microscope:
@@ -150,44 +160,24 @@ class Microscope:
         self._scene[:] = self._empty
 
     def image(
-        self,
-        robot_um: Floats | None,
-        robot_radius_um: float,
-        robot_velocity_um_s: Floats,
-        debris_um: Floats,
-        debris_radii_um: Floats,
-        debris_darkness: Floats,
-        stage_um: Floats | None = None,
-        others: Sequence[DrawnRobot] = (),
+        self, robots: Sequence[DrawnRobot], particles: Particles = NO_PARTICLES, stage_um: Floats | None = None
     ) -> Image:
-        """One frame (h, w): the robot (None: not there) over the debris (n, 2), at the middle of the exposure.
+        """One frame (h, w): the robots over the particles, at the middle of the exposure.
 
-        `stage_um` (2,) is how far the stage, and all that is on it, has moved; None: not at all. `others` are the other
-        robots in view. Where two lie over each other the light is that through both.
+        `stage_um` (2,) is how far the stage, and all that is on it, has moved; None: not at all. Where two lie over
+        each other the light is that through both.
         """
+        to_px, off_um = self._calibration.to_px, np.zeros(2)
         if stage_um is not None:
-            shift = self._calibration.vectors_to_px(stage_um)
+            off_um, shift = stage_um, self._calibration.vectors_to_px(stage_um)
             move = np.column_stack((np.eye(2), shift))
             size = self._scene.shape[::-1]
             cv2.warpAffine(self._empty, move, size, dst=self._scene, borderMode=cv2.BORDER_REPLICATE)
-            debris_um = debris_um + stage_um
-            robot_um = None if robot_um is None else robot_um + stage_um
-        windows = [
-            self._particle(self._scene, place, radius, darkness)
-            for place, radius, darkness in zip(
-                self._calibration.to_px(debris_um).tolist(),
-                debris_radii_um.tolist(),
-                debris_darkness.tolist(),
-                strict=True,
-            )
-        ]
-        robots = [
-            each._replace(position_um=each.position_um + (0.0 if stage_um is None else stage_um)) for each in others
-        ]
-        if robot_um is not None:
-            robots.append(DrawnRobot(robot_um, robot_radius_um, robot_velocity_um_s, _DARKNESS))
+        places = to_px(particles.points_um + off_um).tolist()
+        looks = zip(places, particles.radii_um.tolist(), particles.darkness.tolist(), strict=True)
+        windows = [self._particle(self._scene, *each) for each in looks]
         for each in robots:
-            place = self._calibration.to_px(each.position_um).tolist()
+            place = to_px(each.position_um + off_um).tolist()
             smear = self._calibration.vectors_to_px(each.velocity_um_s * self._camera.exposure_s).tolist()
             windows.append(self._particle(self._scene, place, each.radius_um, each.darkness, smear))
         height, width = self._scene.shape

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.core import Floats32, Truth
+from flowrec.core import Floats32, RigError, Truth
 from flowrec.physics import Chip, Robot
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.microscope import DrawnRobot
@@ -101,11 +101,16 @@ def other_robots(
     clearance_um: Floats32,
     **options: Any,
 ) -> list[OtherRobot]:
-    """The other robots of a world, at their starts; `robot`, `start_um` are the first one's."""
+    """The other robots of a world, at their starts; `robot`, `start_um` are the first one's.
+
+    Raises RigError: the chip has no place for one.
+    """
     if simulated.robots == 1:
         return []
     rng = np.random.default_rng([simulated.seed, _STREAM])
     rows, columns = np.nonzero(chip.mask & (clearance_um > _ROOM_RADII * robot.radius_um))
+    if not len(rows):
+        raise RigError(f"chip '{chip.name}' has no room for another robot; set simulated.robots = 1")
     places = np.stack((columns, rows), -1) * chip.um_per_px
     away = np.hypot(*(places - start_um).T) / robot.radius_um
     near = places[(away > _NEAR_RADII) & (away < _FAR_RADII)]

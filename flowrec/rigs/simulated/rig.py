@@ -35,9 +35,9 @@ from flowrec.core import (
 from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.beads import Beads
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
-from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.microscope import DrawnRobot, Microscope, Particles
 from flowrec.rigs.simulated.others import OtherRobot, other_robots
-from flowrec.rigs.simulated.pump_sensor import PumpSensor
+from flowrec.rigs.simulated.pump import PumpSensor
 from flowrec.rigs.simulated.world import (
     Shake,
     TrueCoils,
@@ -229,8 +229,7 @@ class SimulatedRig:
 
     def picture(self) -> Image:
         """The chip alone."""
-        nothing = np.zeros(0)
-        return self._microscope().image(None, 0.0, np.zeros(2), np.zeros((0, 2)), nothing, nothing, None)
+        return self._microscope().image(())
 
     def inputs(self) -> Iterator[Inputs]:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
@@ -260,16 +259,13 @@ class SimulatedRig:
                 debris.drift(elapsed)
                 beads.drift(elapsed)
             self._now_ns = stamp
-            image = microscope.image(
-                None if swimmer.gone else swimmer.position_um,
-                radius,
-                (swimmer.position_um - before) / elapsed if elapsed > 0 else np.zeros(2),
-                np.concatenate((debris.points_um[moving], beads.points_um)),
-                radii,
-                darkness,
-                None if self._shake is None else self._shake.at(seconds(stamp)),
-                [each.look(elapsed) for each in others if not each.gone],
-            )
+            robots = [each.look(elapsed) for each in others if not each.gone]
+            if not swimmer.gone:
+                velocity = (swimmer.position_um - before) / elapsed if elapsed > 0 else np.zeros(2)
+                robots.append(DrawnRobot(swimmer.position_um, radius, velocity))
+            particles = Particles(np.concatenate((debris.points_um[moving], beads.points_um)), radii, darkness)
+            stage_um = None if self._shake is None else self._shake.at(seconds(stamp))
+            image = microscope.image(robots, particles, stage_um)
             arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
             if self._realtime:
                 # An image arrives after its exposure. The first one, with all its preparation, sets the clock.

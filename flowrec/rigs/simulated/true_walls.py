@@ -30,8 +30,6 @@ _WIDTHS = (0.6, 1.3)  # times the median, of a place to be blocked: wider ones a
 _FARTHEST_PX = 1.1  # largest level of a pixel centre, as the solver states it
 _BLOCK_LENGTH = 0.6  # half length of the obstacle along the channel, in widths
 
-Mask = Bools
-
 
 def true_walls(
     chip: Chip, wall_error_px: float, blocked_share: float, clear_um: Floats, rng: np.random.Generator
@@ -74,7 +72,7 @@ def true_walls(
     return replace(true, mask=np.ascontiguousarray(fluid)), ", ".join(words)
 
 
-def _ridge(inside: Mask) -> tuple[Mask, Floats]:
+def _ridge(inside: Bools) -> tuple[Bools, Floats]:
     """The pixels in the middle between walls, and the distance (h, w) of every pixel to the nearest wall, in pixels.
 
     In the middle the distance has no slope, as in median_width_um.
@@ -83,7 +81,7 @@ def _ridge(inside: Mask) -> tuple[Mask, Floats]:
     return inside & (np.hypot(*np.gradient(distance)) <= 0.55), distance
 
 
-def _core(inside: Mask) -> Mask:
+def _core(inside: Bools) -> Bools:
     """The pixels within _CORE of the way from the middle of a channel to its wall."""
     ridge, distance = _ridge(inside)
     if not ridge.any():
@@ -92,7 +90,7 @@ def _core(inside: Mask) -> Mask:
     return away <= _CORE * distance[rows, columns]
 
 
-def _without_specks(fluid: Mask, before: Mask) -> Mask:
+def _without_specks(fluid: Bools, before: Bools) -> Bools:
     """Remove pieces of a few pixels that were part of larger ones before, such as a corner that is cut off.
 
     A piece of a wall becomes fluid, a piece of fluid a wall; a post that was small before stays.
@@ -102,7 +100,7 @@ def _without_specks(fluid: Mask, before: Mask) -> Mask:
     return fluid & ~_specks(fluid, before, None)
 
 
-def _specks(inside: Mask, before: Mask, neighbours: Floats | None) -> Mask:
+def _specks(inside: Bools, before: Bools, neighbours: Floats | None) -> Bools:
     """The pixels of small pieces of `inside` whose pixels were in a piece of `before` of more than twice their size."""
     pieces, count = scipy.ndimage.label(inside, neighbours)
     whole, _ = scipy.ndimage.label(before, neighbours)
@@ -115,7 +113,7 @@ def _specks(inside: Mask, before: Mask, neighbours: Floats | None) -> Mask:
 
 def _obstacle(
     true: Chip, origin: float, share: float, channel: float, clear_um: Floats, rng: np.random.Generator
-) -> tuple[Mask, tuple[float, float]]:
+) -> tuple[Bools, tuple[float, float]]:
     """The pixels of half an ellipse on one wall of a branch, and the place in um; `channel` is a width in pixels."""
     fluid = true.mask
     ridge, distance = _ridge(fluid)
@@ -149,7 +147,7 @@ def _obstacle(
     return block, (float(place[0]), float(place[1]))
 
 
-def cut_up(mask: Mask, cut: int) -> Mask:
+def cut_up(mask: Bools, cut: int) -> Bools:
     """A mask with each pixel cut into cut x cut."""
     return np.repeat(np.repeat(mask, cut, axis=0), cut, axis=1)
 

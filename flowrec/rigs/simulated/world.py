@@ -18,7 +18,9 @@ from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.true_walls import at_centres, on_pixels, origin_um, true_walls
 from flowrec.stages import Coils, Simulated, field_limits
 
-_STREAM = 7  # of the seed; bodies, microscope, chip and clock have 1 to 6 and 8
+_STREAM = (
+    7  # of the seed; bodies, microscope, chip and clock have 1 to 6 and 8, beads 9, other robots 10, the sensor 34
+)
 # In the order of their random numbers; new ones at the end.
 _DRAWN = (
     *("depth", "walls", "drift", "pulsation_hz", "pulsation_phase"),

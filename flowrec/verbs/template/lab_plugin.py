@@ -124,7 +124,7 @@ class PumpPressure:
     topic: ClassVar[Topic] = Topic("/lab_plugin/pressure", Source.RIG, type=Pressure)
 
     def stream(self) -> Iterator[Pressure]:
-        """See flowrec.run.streams; the loop stamps what it takes."""
+        """See Streams of flowrec.run.stream_inputs; the loop stamps what it takes."""
         while True:
             yield Pressure(0, 2e4 + 500.0 * math.sin(time.monotonic()))
             time.sleep(self.every_s)

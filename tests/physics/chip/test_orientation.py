@@ -15,8 +15,7 @@ MIDDLE_PX = (159.5, 127.5)
 def pictured(chip, true):
     camera = ResolvedCamera(width_px=SIZE_PX[0], height_px=SIZE_PX[1], rate_hz=30.0, um_per_px=true.um_per_px)
     microscope = Microscope(chip.mask, chip.um_per_px, true, camera, SimulatedImage(), 1, "disc", (0.0, 0.0))
-    nothing = np.zeros(0)
-    return microscope.image(None, 0.0, np.zeros(2), np.zeros((0, 2)), nothing, nothing, None)
+    return microscope.image(())
 
 
 def stated(chip, angle_deg=0.0, mirror=False):

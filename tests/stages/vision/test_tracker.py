@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import Frame, Track
 from flowrec.physics import Calibration, ChipSettings, Robot, clearance_um, load_chip
-from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.microscope import DrawnRobot, Microscope, Particles
 from flowrec.stages import ResolvedCamera, SimulatedImage, Tracker
 
 CHIP = load_chip(ChipSettings())
@@ -36,9 +36,8 @@ class Scene:
 
     def frame(self, robot_um: NDArray[np.float64] | None, index: int = 0, debris: int = 24) -> Frame:
         radii = self.rng.uniform(0.3, 0.7, debris) * ROBOT.radius_um
-        image = self.microscope.image(
-            robot_um, ROBOT.radius_um, np.zeros(2), self.places(debris, 20.0), radii, np.full(debris, 0.3)
-        )
+        robots = [] if robot_um is None else [DrawnRobot(robot_um, ROBOT.radius_um)]
+        image = self.microscope.image(robots, Particles(self.places(debris, 20.0), radii, np.full(debris, 0.3)))
         return Frame(index * 33_000_000, index, image)
 
     def track(self, previous: Track | None, frame: Frame) -> Track:

@@ -52,12 +52,7 @@ class Played:
 
 
 class NiAmplifier:
-    """See amplifier.Amplifier.
-
-    Attributes
-    ----------
-    underruns : how often the output ran dry.
-    """
+    """See amplifier.Amplifier."""
 
     @classmethod
     def of(cls, config: ResolvedConfig) -> Self:
@@ -67,7 +62,6 @@ class NiAmplifier:
         return cls(NiSettings(ni.channels, ni.server, *of_run, ni.inputs, ni.volts_per_a))
 
     def __init__(self, settings: NiSettings) -> None:
-        self.underruns = 0
         self._settings = settings
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Any = None  # the end of a multiprocessing.Pipe
@@ -200,7 +194,6 @@ class NiAmplifier:
             self._read_back = given[0]
         elif what == "fault":
             self._fault = given[0]
-            self.underruns += "ran dry" in self._fault
             self._cuts.append(time.monotonic_ns())
         return what, given[0] if given else None
 

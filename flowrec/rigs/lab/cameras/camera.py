@@ -11,16 +11,11 @@ import re
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
-from flowrec.core import RigError
+from flowrec.core import Image, RigError
 from flowrec.stages import CAMERAS, CameraSettings, Lab
 
 SOFTWARE = "software"  # value of Wanted.trigger
 _NOTABLE = 0.01  # relative difference between what was asked and what is
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,16 +18,8 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Self, TypeVar
 
-from flowrec.core import (
-    CameraLosses,
-    Fit,
-    Priority,
-    RigError,
-    nanoseconds,
-    realtime_priority,
-    seconds,
-)
-from flowrec.rigs.lab.cameras.camera import SOFTWARE, Camera, CameraInfo, Grabbed, Image, Wanted
+from flowrec.core import CameraLosses, Fit, Image, Priority, RigError, nanoseconds, realtime_priority, seconds
+from flowrec.rigs.lab.cameras.camera import SOFTWARE, Camera, CameraInfo, Grabbed, Wanted
 from flowrec.rigs.lab.cameras.device_counts import BlockIds, Stamper
 
 _SLICE_S = 0.1  # longest wait in the driver, so that the thread ends promptly

@@ -13,17 +13,8 @@ from typing import cast
 import cv2
 import numpy as np
 
-from flowrec.core import RigError
-from flowrec.rigs.lab.cameras.camera import (
-    Camera,
-    CameraInfo,
-    Grabbed,
-    Image,
-    NoCameraError,
-    Wanted,
-    bits_of,
-    difference,
-)
+from flowrec.core import Image, RigError
+from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, NoCameraError, Wanted, bits_of, difference
 
 _TIMEOUT_MS = 1000
 _COLOUR_NOTE = "the camera sends colours: their luminance is used"

@@ -25,7 +25,6 @@ class CameraProbe:
     Attributes
     ----------
     rate_hz : of the camera, by its block ids: losses do not lower it; 0 with less than two frames.
-    delivered_hz : of the frames that were handed on.
     losses : by cause; None: not one frame came.
     clock_slope : time of the host per time of the camera's clock as it states its unit: 1 within some 1e-3 for a probe
         of 2 s, 10 for a camera that states its unit wrongly by as much; 0: no clock.
@@ -37,7 +36,6 @@ class CameraProbe:
 
     info: CameraInfo
     rate_hz: float
-    delivered_hz: float
     losses: CameraLosses | None
     clock_slope: float
     arrival_ms: float
@@ -107,14 +105,13 @@ def probe_camera(camera: CameraSettings, lab: Lab, *, as_it_is: bool = False) ->
     if not frames and not wanted.trigger:
         raise RigError(f"camera {info.model} {info.serial}: it delivers no frame; see its trigger, cable and bandwidth")
     if not frames:
-        return CameraProbe(info, 0.0, 0.0, losses, 0.0, 0.0, 0, (*notes, f"no trigger has come at {wanted.trigger}"))
+        return CameraProbe(info, 0.0, losses, 0.0, 0.0, 0, (*notes, f"no trigger has come at {wanted.trigger}"))
     first, last = frames[0], frames[-1]
     span_s = max(seconds(last.stamp_ns - first.stamp_ns), 1e-9)
     arrivals = [frame.arrival_ns for frame in frames]
     return CameraProbe(
         info,
         rate_hz=(last.index - first.index) / span_s,
-        delivered_hz=(len(frames) - 1) / span_s,
         losses=losses,
         clock_slope=_slope(frames, info),
         arrival_ms=max((b - a for a, b in itertools.pairwise(arrivals)), default=0) / 1e6,
