@@ -22,7 +22,7 @@ from flowrec.core import (
     Track,
     Truth,
 )
-from flowrec.store import SessionHeader, codec
+from flowrec.store import SessionHeader, SessionWriter, WriterOptions, codec
 from flowrec.store.channels import message_codec
 from flowrec.store.write_queue import Entry
 
@@ -102,6 +102,16 @@ def ticks_of(count: int, *, shape: tuple[int, int] = (48, 64), seed: int = 0, im
             news["operator"] = OperatorEvent(now, "note", "a: b")
         tick = replace(tick, stamp_ns=now, **news)
         yield tick
+
+
+def write_session(path, ticks, header=HEADER, outcome=None, **options):
+    """Write a session with these options; its path."""
+    with SessionWriter(path, header, WriterOptions(**({"block": True} | options))) as writer:
+        for tick in ticks:
+            writer.write(tick)
+        if outcome is not None:
+            writer.close(outcome)
+    return path
 
 
 def same(one, other, but=()):

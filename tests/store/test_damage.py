@@ -28,7 +28,7 @@ from flowrec.core import Currents, SessionError
 from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, merged_chunks, session_metadata
 from flowrec.store.mcap_writer import McapWriter, new_mcap
 from tests.conftest import HANG_S
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, ticks_of, write_session
 
 TICKS = list(ticks_of(30, shape=(8, 8)))
 
@@ -36,10 +36,7 @@ TICKS = list(ticks_of(30, shape=(8, 8)))
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     path = tmp_path_factory.mktemp("trouble") / "session.mcap"
-    with SessionWriter(path, HEADER) as writer:
-        for tick in TICKS:
-            writer.write(tick)
-    return path
+    return write_session(path, TICKS, block=False)
 
 
 def names_in(directory):

@@ -25,7 +25,7 @@ from flowrec.store.run_files import run_files
 from flowrec.store.scan import scan
 from flowrec.store.segments import RecordingPlan
 from flowrec.store.session_file import Split
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, same, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, same, ticks_of, write_session
 from tests.store.test_damage import names_in
 from tests.store.test_durability import GatedDisk, slow_disk
 
@@ -221,9 +221,7 @@ def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, m
     monkeypatch.setattr(McapWriter, "add_chunks", refuse)
 
     def fly():
-        with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=Split(seconds=1.0), block=True)) as writer:
-            for tick in TICKS:
-                writer.write(tick)
+        write_session(tmp_path / "x.mcap", TICKS, files=Split(seconds=1.0))
 
     with pytest.raises(SessionError, match=r"part002\.mcap\.partial: the disk is full"):
         fly()

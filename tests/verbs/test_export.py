@@ -15,9 +15,9 @@ import pytest
 import flowrec
 from flowrec.core import OutputError, SessionError, UsageError
 from flowrec.exports import EXPORTS
-from flowrec.store import SessionWriter, WriterOptions
 from flowrec.verbs.view import view
 from tests.conftest import invoke
+from tests.store.made_up import write_session
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
@@ -33,11 +33,7 @@ def any_export(request: pytest.FixtureRequest) -> str:
 def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first ticks of the golden session: what is made of it again and again need not be long."""
     path, session = tmp_path_factory.mktemp("brief") / "brief.mcap", flowrec.open(GOLDEN)
-    with SessionWriter(path, session.header, WriterOptions(block=True)) as writer:
-        for tick in islice(session.ticks(), 10):
-            writer.write(tick)
-        writer.close({"outcome": "stopped"})
-    return path
+    return write_session(path, islice(session.ticks(), 10), session.header, outcome={"outcome": "stopped"})
 
 
 def test_the_ending_of_an_output_names_its_format_and_one_that_names_none_is_asked_for(
