@@ -11,13 +11,12 @@ from flowrec.verbs.command import MisuseError, verb
 from flowrec.verbs.options import AS_THE_COMMAND, Sets, readable_toml
 
 if TYPE_CHECKING:
-    from flowrec.stages import Config
     from flowrec.verbs.diagnosis import Finding
     from flowrec.verbs.protocol import DayProtocol
 
 
 class Diagnosis:
-    """Iterator over findings, each as it is looked at; `findings` holds those so far."""
+    """Findings about a lab; each thing is looked at when `lines` comes to it, and `findings` holds those so far."""
 
     def __init__(self, coming: Iterator["Finding"]) -> None:
         self.findings: list[Finding] = []
@@ -110,10 +109,3 @@ def doctor(
     except UsageError as error:
         chosen, wrong = of_devices(config, settings, error), str(error)
     return Diagnosis(diagnose(chosen, config, folder, wrong))
-
-
-def look_at_lab(chosen: "Config", file: Path | None, out: Path | None) -> Diagnosis:
-    """Diagnose the lab of a run, for `flowrec record --dry-run`."""
-    from flowrec.verbs.diagnosis import diagnose
-
-    return Diagnosis(diagnose(chosen, file, out.parent if out is not None else None))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from flowrec.store import Column, Part, Session
 
 
-_PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
+_PNG_SIZE = struct.Struct(">II")  # width and height
 _PNG_SIZE_AT = 16  # bytes, after the signature and the head of the first part
 _STATED = ("seed", "world", "operator", "sample", "notes")  # in the provenance
 _OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance
