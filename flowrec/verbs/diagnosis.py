@@ -204,8 +204,7 @@ def _camera(config: ResolvedConfig, chip: Chip | None) -> _Rows:
     camera = config.camera
     seen = probe_camera(camera, config.lab)
     info = seen.info
-    name = " ".join(filter(None, (info.model, info.serial)))
-    yield "camera", OK, f"{name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}"
+    yield "camera", OK, f"{info.name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}"
     if (info.width_px, info.height_px, info.bits) != (*camera.size_px, camera.bits):
         yield (
             "camera",

@@ -43,7 +43,6 @@ class Diagnosis:
         return int(self.level == "failure")
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         return {"level": self.level, "findings": [one._asdict() for one in self.findings]}
 
 

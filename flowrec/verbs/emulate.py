@@ -25,7 +25,6 @@ class Flown(NamedTuple):
     latency: str = ""
 
     def as_json(self) -> dict[str, str | None]:
-        """For JSON."""
         return {"session": str(self.session) if self.session else None, "latency": self.latency}
 
     def show(self) -> None:

@@ -48,7 +48,6 @@ class Facts(dict[str, Any]):
     columns: "dict[str, tuple[Column, ...]]"
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         tables = {name: [asdict(column) for column in columns] for name, columns in self.columns.items()}
         return {"session": str(self.path), "facts": self, "topics": self.topics} | (
             {"tables": tables} if tables else {}

@@ -45,7 +45,6 @@ class StartedConfig(NamedTuple):
     still: bool  # it is one image alone
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         return {name: str(value) if isinstance(value, Path) else value for name, value in self._asdict().items()}
 
     def lines(self) -> list[str]:

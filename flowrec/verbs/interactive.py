@@ -139,7 +139,6 @@ class StatusLine:
                 thread.join(_CLOSE_TIMEOUT_S)
 
     def __call__(self, tick: Tick) -> None:
-        """Take one tick."""
         self._arrivals.append(time.perf_counter())
         if tick.timing is not None:
             self._latency_ms.append(tick.timing.total_ms)

@@ -158,7 +158,6 @@ class SessionComparison:
         return [*(part.name for part in self.head if part.differences), *lone, *dict.fromkeys(topics)]
 
     def as_json(self) -> dict[str, Any]:
-        """The result for JSON."""
         return self.comparison.as_json() | {
             "same": self.same,
             "identical": self.identical,

@@ -33,19 +33,8 @@ from flowrec.stages import config_from_toml
 from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
 from tests.conftest import invoke
-from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, small_draft, text
-from tests.store.hostile import (
-    FRAMES,
-    STATE,
-    attached,
-    file_of,
-    packed_map,
-    refused,
-    saved,
-    with_head,
-    with_message,
-    with_piece,
-)
+from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, packed_map, small_draft, text
+from tests.store.hostile import FRAMES, STATE, attached, file_of, refused, saved, with_head, with_message, with_piece
 from tests.store.made_up import HEADER, encode, write_session
 
 NAMES = ["../../x", "/etc/flowrec", "C:\\x", "weights/../../../x", "a\0b", "\x1b[2J"]

@@ -17,7 +17,7 @@ from flowrec.core import CameraLosses, Ended, SessionError, Tick
 from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
 from tests.conftest import typed
-from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
+from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, packed_map, small_draft, text
 from tests.store.made_up import HEADER, ticks_of, write_session
 from tests.store.test_run_files import in_parts
 
@@ -42,8 +42,7 @@ def only(keep):
 
 
 def ending(**said):
-    pairs = b"".join(text(key) + text(value) for key, value in said.items())
-    return ((METADATA, text("flowrec.outcome") + struct.pack("<I", len(pairs)) + pairs),)
+    return ((METADATA, text("flowrec.outcome") + packed_map(said)),)
 
 
 def found(verdict):

@@ -76,12 +76,6 @@ def test_an_export_replaces_an_earlier_export_of_the_same_session_and_no_other_f
             flowrec.export(session, file_format=any_export)
 
 
-def test_the_help_of_export_lists_every_format_with_its_summary(any_export: str) -> None:
-    shown = invoke("export", "--help", env={"COLUMNS": "200"}).stdout
-    words = " ".join(shown.split())
-    assert f"{any_export}: {EXPORTS[any_export].summary}" in words
-
-
 def test_an_unknown_format_is_an_error_that_names_the_formats(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--format = 'cvs': .*rrd"):
         flowrec.export(GOLDEN, tmp_path / "x.cvs", file_format="cvs")

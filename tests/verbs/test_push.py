@@ -20,15 +20,7 @@ import flowrec
 from flowrec.archive.push import PushedFile, push
 from flowrec.archive.verbs import push as push_verb
 from flowrec.core import Ended, FlowrecError, StoppedError, UsageError
-from flowrec.store import (
-    TRAFFIC,
-    Session,
-    UrlPath,
-    bucket_upload,
-    part_path,
-    remote_file,
-    session_sha256,
-)
+from flowrec.store import TRAFFIC, Session, UrlPath, bucket_upload, part_path, remote_file, session_sha256
 from tests.conftest import HANG_S, invoke, until
 from tests.store.made_up import ticks_of, write_session
 from tests.store.s3_server import BUCKET, KEYS, S3Server, s3_server

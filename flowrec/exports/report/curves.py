@@ -57,7 +57,6 @@ class CurveBuilder:
         self._rows: dict[int, tuple[int, float, float, float, float]] = {}  # number, time, mean, low, high by bucket
 
     def add(self, stamp_ns: int, value: float) -> None:
-        """Take a value."""
         if not math.isfinite(value):
             return
         at = min(max(int((stamp_ns - self._first_ns) * self._per_ns), 0), BUCKETS - 1)
