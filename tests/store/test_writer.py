@@ -358,9 +358,5 @@ def test_a_chunk_is_sealed_before_it_outgrows_what_a_reader_takes_and_no_message
     frames = next(number for number, each in summary.channels.items() if each.topic == "/camera/frame")
     chunks = [chunk for chunk in summary.chunk_indexes if frames in chunk.message_index_offsets]
     assert len(chunks) == 6 and all(80_000 < chunk.uncompressed_size < 101_000 for chunk in chunks)
-
-    def one(shape):
-        write_session(tmp_path / "y.mcap", ticks_of(1, shape=shape), frames="raw", flush_s=100.0, sync_s=100.0)
-
     with pytest.raises(SessionError, match=r"/camera/frame .*\d+ bytes"):
-        one((400, 300))
+        write_session(tmp_path / "y.mcap", ticks_of(1, shape=(400, 300)), frames="raw")

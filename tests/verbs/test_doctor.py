@@ -22,6 +22,7 @@ from flowrec.verbs import diagnosis
 from flowrec.verbs.diagnosis import FAILURE, OK, WARNING, diagnose
 from tests.conftest import invoke
 from tests.physics.chip.looks import LOOKS, picture
+from tests.short_missions import set_words
 
 MEASURED = (
     "rig=lab",
@@ -150,7 +151,7 @@ def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path) -> Non
 def without_devices(folder: Path, *sets: str) -> tuple[dict[str, str], set[str]]:
     """Failures of a lab whose camera and amplifier are missing, and all that was looked at."""
     asked = (*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing", *sets)
-    words = ["doctor", "--json", "--folder", str(folder), *(word for each in asked for word in ("--set", each))]
+    words = ["doctor", "--json", "--folder", str(folder), *set_words(asked)]
     done = invoke(*words)
     assert done.exit_code == 1, done.output
     found = json.loads(done.stdout)
