@@ -368,7 +368,7 @@ def _viewer() -> _Row:
 def of_devices(file: Path | None, sets: Mapping[str, Any], wrong: UsageError) -> Config:
     """The settings of camera and coils that are right in themselves, where the whole configuration is refused.
 
-    Raises UsageError: `wrong`, where the configuration is none of a lab; the file can not be read.
+    Raises UsageError: `wrong`, if the configuration does not describe a lab; or the file can not be read.
     """
     tree: dict[str, Any] = read_toml(file) if file is not None else {}
     apply_sets(tree, sets)

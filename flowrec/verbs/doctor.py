@@ -85,7 +85,7 @@ def doctor(
 
     Raises
     ------
-    UsageError : the configuration is wrong, and is none of a lab.
+    UsageError : the configuration is wrong and does not describe a lab.
     """
     from flowrec.core import settings_of
     from flowrec.stages import load_config

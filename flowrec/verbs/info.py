@@ -172,7 +172,7 @@ def _piece(part: "Part", path: Path) -> str:
 
 
 def _chip(session: "Session") -> dict[str, Any]:
-    """Name, size and number of openings, which is None where nobody asked for a flow, see Chip.is_still."""
+    """Name, size and number of openings; the number is None if the chip is still, see Chip.is_still."""
     from flowrec.store import toml_table
 
     header = session.header

@@ -88,7 +88,7 @@ class Span:
 
 
 class SpanBuilder:
-    """Takes the states of successive ticks; '' is none. No more than _MOST_SPANS are kept."""
+    """Takes the states of successive ticks; '' means no state. No more than _MOST_SPANS are kept."""
 
     def __init__(self) -> None:
         self.spans: list[Span] = []
