@@ -17,7 +17,7 @@ import pytest
 import flowrec
 from flowrec.core import SessionError, Tick, UsageError
 from tests.conftest import HANG_S, until
-from tests.short_missions import LONG, SMALL
+from tests.short_missions import LONG, SMALL, set_words
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "sessions" / "golden.mcap"
@@ -155,7 +155,7 @@ def test_what_is_no_session_is_refused_in_one_line(name: str, tmp_path: Path) ->
 
 @pytest.mark.slow("a real recording in a process of its own")
 def test_a_finished_part_can_be_read_while_another_process_records_the_next_one(tmp_path: Path) -> None:
-    sets = [word for setting in (*LONG, "recording.split_s=0.5") for word in ("--set", setting)]
+    sets = set_words((*LONG, "recording.split_s=0.5"))
     out = tmp_path / "run.mcap"
     words = [sys.executable, "-m", "flowrec", "record", "--realtime", "--duration", "60", "--out", out, *sets]
     process = subprocess.Popen([*map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

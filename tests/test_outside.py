@@ -21,7 +21,7 @@ from flowrec.stages import to_toml
 from flowrec.store import Session
 from tests.conftest import needs_quiet
 from tests.rewritten import rewrite
-from tests.short_missions import SMALL
+from tests.short_missions import SMALL, set_words
 
 ROOT = Path(__file__).parents[1]
 STEPS = "plan.method=lab_kit_steps"
@@ -71,10 +71,6 @@ def flowrec(site: Path | None, *lines: str | list[str]) -> list[Said]:
     return [Said(*each) for each in json.loads(done.stdout)]
 
 
-def sets(*texts: str) -> list[str]:
-    return [word for text in texts for word in ("--set", text)]
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which the package of the template is installed."""
@@ -97,7 +93,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def flown(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session whose route is by the package's planner, with the pressure of its pump."""
     path = tmp_path_factory.mktemp("flown") / "a.mcap"
-    (done,) = flowrec(site, ["record", *sets(*MISSION), "--duration", "2", "--out", str(path)])
+    (done,) = flowrec(site, ["record", *set_words(MISSION), "--duration", "2", "--out", str(path)])
     assert done.status == 0, done.err
     return path
 
@@ -178,9 +174,9 @@ def test_a_topic_of_a_package_is_recorded_and_read_compared_exported_and_replaye
 def test_settings_of_a_package_are_checked_like_ours_and_shown_by_a_dry_run(site: Path) -> None:
     unknown, beyond, dry, helped = flowrec(
         site,
-        ["record", *sets(STEPS, "plan.lab_kit_steps.neighbour=8")],
-        ["record", *sets(STEPS, "plan.lab_kit_steps.neighbours=5")],
-        ["record", *sets(*MISSION), "--dry-run"],
+        ["record", *set_words([STEPS, "plan.lab_kit_steps.neighbour=8"])],
+        ["record", *set_words([STEPS, "plan.lab_kit_steps.neighbours=5"])],
+        ["record", *set_words(MISSION), "--dry-run"],
         "--help",
     )
     assert unknown.status == beyond.status == 2
@@ -266,7 +262,7 @@ def test_a_broken_package_stops_nothing_that_does_not_use_it(site: Path, flown: 
         "--help",
         f"lab-kit-routes {flown}",
         f"check {flown}",
-        ["record", *sets("plan.method=astar_tim")],
+        ["record", *set_words(["plan.method=astar_tim"])],
     )
     faults = {row["name"]: row["fault"] for row in json.loads(listed.out) if row["fault"]}
     assert faults.keys() == {*("lab_kit_steps", "lab_kit_disc", "lab_kit_pressure", "lab_kit_path", "lab-kit-routes")}
@@ -290,8 +286,8 @@ def test_a_run_of_the_lab_records_the_camera_of_a_package(site: Path, tmp_path: 
     ]
     seen, wrong = flowrec(
         site,
-        ["record", *sets(*lab), "--duration", "1.5", "--out", str(path)],
-        ["record", *sets(*lab, "lab.lab_kit_disc.background=0")],
+        ["record", *set_words(lab), "--duration", "1.5", "--out", str(path)],
+        ["record", *set_words([*lab, "lab.lab_kit_disc.background=0"])],
     )
     assert seen.status == 0, seen.err
     assert "lab.lab_kit_disc.background = 0: must be from 1 to 255" in wrong.err

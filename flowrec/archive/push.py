@@ -76,7 +76,6 @@ class Pushed:
         return 1 if self.failed else 0 if all(each.compared for each in self.files) else 3
 
     def as_json(self) -> dict[str, Any]:
-        """All facts by name."""
         objects = [asdict(each) | {"file": str(each.file), "url": str(each.url)} for each in self.files]
         failed = [{"session": str(path), "error": text} for path, text in self.failed.items()]
         return {"target": self.target, "objects": objects, "failed": failed, "repeated_requests": TRAFFIC.repeated}

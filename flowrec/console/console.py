@@ -1,8 +1,8 @@
 """The console of a run: a page in a browser of this machine that shows the run and steers it.
 
-Its server is a process of its own (server.py), fed with ticks as the live view is, so the run waits neither for it nor
-for a browser. What an operator asks there comes back through a pipe, as words and numbers and never as objects, and
-becomes an event of the run's control, as a key does: in the run's own process, or through its socket.
+Its server is a process of its own (server.py). It gets ticks as the live view does, so the run waits neither for it nor
+for a browser. What an operator asks there comes back through a pipe, as words and numbers and never as objects. Like a
+key, it becomes an event of the run's control: in the run's own process, or through its socket.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ class RerunViewer:
 
 
 class _HandedOn(StreamingResponse):
-    """The answer of Rerun's server, which is closed however it ends, also where a browser takes none of it."""
+    """The answer of Rerun's server. It is closed in any case, also if the browser reads nothing of it."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         assert isinstance(self.body_iterator, AsyncGenerator)

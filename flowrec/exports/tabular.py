@@ -116,8 +116,8 @@ class CsvExport(_Tables):
     """CSV by RFC 4180, UTF-8, numbers exact; an array is a cell with a JSON array, rasters are left out.
 
     The last flow field of each kind is in a table by itself, with a row a pixel. NaN and infinities are `nan` and
-    `inf`, in arrays `NaN` and `Infinity`; what is not stated is an empty cell. A text that a spreadsheet might run has
-    an apostrophe before it, and so has a text that begins with one: without a first apostrophe each is what it was.
+    `inf`, in arrays `NaN` and `Infinity`; what is not stated is an empty cell. An apostrophe is put before a text that
+    a spreadsheet might run, and before one that begins with an apostrophe: a reader takes the first one away.
     https://owasp.org/www-community/attacks/CSV_Injection
     """
 

@@ -77,7 +77,6 @@ class PictureChip(NamedTuple):
         return Chip(name, self.mask, self.pixel_size, self.openings, WATER_MPA_S, WATER_KG_M3)
 
     def as_json(self) -> dict[str, Any]:
-        """The chip as plain numbers."""
         openings = [
             {"name": name, "side": o.side, "first": o.first, "last": o.last, "kind": kind}
             for name, o, kind in self.named_openings

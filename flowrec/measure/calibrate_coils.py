@@ -48,7 +48,6 @@ class CoilProposal(NamedTuple):
         }
 
     def show(self) -> None:
-        """Print the fit as a table."""
         fit, lines = self.fit, self.fit.excitations.lines
         rows = []
         for axis, (name, worst) in enumerate(zip("xyz", fit.worst, strict=True)):

@@ -40,7 +40,6 @@ class ImageRegistration(NamedTuple):
         return int(self.chosen is None)
 
     def as_json(self) -> dict[str, Any]:
-        """The poses as plain numbers."""
         poses = []
         for fit in self.poses:
             x, y, angle, scale = fit.std.tolist()

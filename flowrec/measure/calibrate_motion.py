@@ -197,7 +197,7 @@ def fit_log(
 
 
 def sampled_s(log: FieldLog, image_s: float) -> float | None:
-    """The interval in s of a log whose rows come evenly, and seldom beside images of this interval; None of others.
+    """The interval in s of a log whose rows come evenly and more seldom than images do; None for other logs.
 
     A log with a row for each command has long intervals as well, but uneven ones, and tells all.
     """

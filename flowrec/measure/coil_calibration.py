@@ -103,7 +103,6 @@ def _coils_of(header: list[str]) -> int:
 
 
 def _place(name: str, header: list[str], where: str, names: Sequence[str]) -> int:
-    """Place of a column in the header."""
     given = [each.lower() for each in header]
     if given.count(name) == 1:
         return given.index(name)

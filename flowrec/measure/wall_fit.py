@@ -14,9 +14,9 @@ bright on one side of the channel and dark on the other; with the chip shifted b
 dark outside of the channel, bright inside, and every wall shows half of that. Two things tell:
 
 - The wall of a patch counts as found if its own profile correlates with the f of walls that face the other way.
-- The picture is read twice, as grey levels and as local contrast |grad I|, which is a function of d where I is one, and
-  where I is in relief. Both fits begin at the same pose and end at the same one if it is right; where it is not, their
-  errors have nothing in common. The difference is part of the standard error.
+- The picture is read twice: as grey levels I, and as local contrast |grad I|, which is a function of d also in relief.
+  Both fits begin at the same pose. They end at the same one if it is right; if it is not, their errors have nothing in
+  common. The difference is part of the standard error.
 
 The offsets of the patches across the walls are the residual; the scatter of their normal equations gives the standard
 error of one reading.

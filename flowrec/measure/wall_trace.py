@@ -2,8 +2,8 @@
 
 Along the contour of the mask stand profiles across the wall. They look alike, whatever walls look like: a dark line, a
 step, both. In oblique light they also differ by the direction in which the fluid lies, as a + b cos + c sin of it. A
-chip that lies elsewhere makes the same difference, so this is asked only where walls that may move still look
-different, and begins at the pose of wall_fit.py, which light from one side does not mislead.
+chip that lies elsewhere makes the same difference. So this difference is fitted only if the walls look different even
+after they were allowed to move, and the fit begins at the pose of wall_fit.py, which such light does not mislead.
 
 The wall of each profile is moved to where it correlates best with the common profile, by dynamic programming:
 neighbours along a wall move nearly alike (an active contour; Amini, Weymouth and Jain 1990). The motion that all walls
@@ -197,7 +197,7 @@ def _follow(levels: tuple[Levels, int], contours: WallContours, start: Calibrati
 
 
 def _is_lit_from_one_side(levels: tuple[Levels, int], contours: WallContours, start: Calibration) -> bool:
-    """True where walls that face one way are bright and those that face the other way dark, as in relief.
+    """True if, as in relief, walls that face one way are bright and walls that face the other way are dark.
 
     The extremes of a profile do not tell where on it the wall is, so a chip that lies elsewhere makes no difference. In
     profiles that are moved, relief looks like a chip that lies half a channel aside, and all its walls alike.

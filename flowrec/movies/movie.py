@@ -35,7 +35,8 @@ MOVIE_READERS = Methods(
 LARGEST_PX, SMALLEST_PX = 16_384, 8  # as of camera.width_px and height_px
 MOST_PIXELS = 150_000_000
 MOST_IMAGES = 20_000_000  # nine hours at 600 Hz; a file that declares more is damaged
-_MEDIAN_BYTES = 400_000_000  # of the images that a median is taken of
+_MEDIAN_IMAGES = 31  # that a median is taken of, at most
+_MEDIAN_BYTES = 400_000_000  # of those images, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,15 +159,15 @@ class Movie(Closing):
             raise MovieError(f"{self.path}: {why}{advice}") from error
         self._cut = [f"only the first {read} images were taken: {why}"]
 
-    def median_image(self, count: int = 31) -> Image:
-        """Median of at most `count` images spread over the movie: what does not move, such as the chip."""
-        return median_of(self.image(index) for index in self.median_indices(count))
+    def median_image(self) -> Image:
+        """Median of images spread over the movie: what does not move, such as the chip."""
+        return median_of(self.image(index) for index in self.median_indices())
 
-    def median_indices(self, count: int = 31) -> list[int]:
+    def median_indices(self) -> list[int]:
         """The images that `median_image` takes."""
         facts = self.facts
         affordable = _MEDIAN_BYTES // (facts.width_px * facts.height_px * pixel_type(facts.bits).itemsize)
-        count = max(min(count, facts.frames, affordable), 1)
+        count = max(min(_MEDIAN_IMAGES, facts.frames, affordable), 1)
         return np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int)).tolist()
 
     def _grey(self, array: NDArray[Any], index: int) -> Image:

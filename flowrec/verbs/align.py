@@ -4,9 +4,9 @@ The robot is tracked once through the movie, and its track is fitted to the log 
 found become settings: movie.clock_rate and movie.clock_offset_s, and movie.heading_mirrored and heading_offset_deg if
 the axes of the log are turned or mirrored. So the session holds them, and a replay does not depend on the fit.
 
-The um per revolution that are found are used where they differ from the stated ones by more than three of their
-standard errors, because 10 % cost as much in the refined flow as no refinement at all. The flow that is assumed is part
-of the fit, with a scale of its own: without it the error is twice as large.
+The um per revolution that were found replace the stated ones if they differ by more than three standard errors: an
+error of 10 % spoils the refined flow as much as no refinement at all. The assumed flow is part of the fit, with a scale
+of its own: without it the error is twice as large.
 """
 
 from __future__ import annotations

@@ -139,7 +139,6 @@ class TopicCount:
             self.see(later.first)
 
     def as_json(self) -> dict[str, Any]:
-        """The result for JSON."""
         return asdict(self) | {"first": self.first.as_json() if self.first is not None else None}
 
 
@@ -273,7 +272,6 @@ class Comparison:
         return lines + [printable(f"{what:{width}s}  {why}") for what, why in self.not_recorded.items()]
 
     def as_json(self) -> dict[str, Any]:
-        """The result for JSON."""
         return {
             "same": self.same,
             "identical": self.identical,

@@ -26,11 +26,9 @@ class CutSession(NamedTuple):
     to_s: float
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         return self._asdict() | {"path": str(self.path)}
 
     def lines(self) -> list[str]:
-        """As text."""
         stretch = f"{self.ticks} ticks, {self.from_s:g} s to {self.to_s:g} s"
         return [
             f"{self.path}: {stretch}; it replays from its first tick: flowrec replay {shell_word(self.path)} --verify"

@@ -204,8 +204,7 @@ def _camera(config: ResolvedConfig, chip: Chip | None) -> _Rows:
     camera = config.camera
     seen = probe_camera(camera, config.lab)
     info = seen.info
-    name = " ".join(filter(None, (info.model, info.serial)))
-    yield "camera", OK, f"{name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}"
+    yield "camera", OK, f"{info.name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}"
     if (info.width_px, info.height_px, info.bits) != (*camera.size_px, camera.bits):
         yield (
             "camera",
@@ -369,7 +368,7 @@ def _viewer() -> _Row:
 def of_devices(file: Path | None, sets: Mapping[str, Any], wrong: UsageError) -> Config:
     """The settings of camera and coils that are right in themselves, where the whole configuration is refused.
 
-    Raises UsageError: `wrong`, where the configuration is none of a lab; the file can not be read.
+    Raises UsageError: `wrong`, if the configuration does not describe a lab; or the file can not be read.
     """
     tree: dict[str, Any] = read_toml(file) if file is not None else {}
     apply_sets(tree, sets)

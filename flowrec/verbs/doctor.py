@@ -11,13 +11,12 @@ from flowrec.verbs.command import MisuseError, verb
 from flowrec.verbs.options import AS_THE_COMMAND, Sets, readable_toml
 
 if TYPE_CHECKING:
-    from flowrec.stages import Config
     from flowrec.verbs.diagnosis import Finding
     from flowrec.verbs.protocol import DayProtocol
 
 
 class Diagnosis:
-    """Iterator over findings, each as it is looked at; `findings` holds those so far."""
+    """Findings about a lab; each thing is looked at when `lines` comes to it, and `findings` holds those so far."""
 
     def __init__(self, coming: Iterator["Finding"]) -> None:
         self.findings: list[Finding] = []
@@ -44,7 +43,6 @@ class Diagnosis:
         return int(self.level == "failure")
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         return {"level": self.level, "findings": [one._asdict() for one in self.findings]}
 
 
@@ -87,7 +85,7 @@ def doctor(
 
     Raises
     ------
-    UsageError : the configuration is wrong, and is none of a lab.
+    UsageError : the configuration is wrong and does not describe a lab.
     """
     from flowrec.core import settings_of
     from flowrec.stages import load_config
@@ -110,10 +108,3 @@ def doctor(
     except UsageError as error:
         chosen, wrong = of_devices(config, settings, error), str(error)
     return Diagnosis(diagnose(chosen, config, folder, wrong))
-
-
-def look_at_lab(chosen: "Config", file: Path | None, out: Path | None) -> Diagnosis:
-    """Diagnose the lab of a run, for `flowrec record --dry-run`."""
-    from flowrec.verbs.diagnosis import diagnose
-
-    return Diagnosis(diagnose(chosen, file, out.parent if out is not None else None))

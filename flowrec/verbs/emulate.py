@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Union
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Union
 
 import typer
 
@@ -17,23 +17,20 @@ if TYPE_CHECKING:
 _SLICE_S = 0.5  # of the wait for Ctrl-C
 
 
-class Flown:
-    """A mission that was flown on emulated devices, or none.
+class Flown(NamedTuple):
+    """A mission that was flown on emulated devices, or none."""
 
-    `exit_status`: of the recorder.
-    """
-
-    def __init__(self, session: Path | None = None, exit_status: int = 0, latency: str = "") -> None:
-        self.session, self.exit_status, self._latency = session, exit_status, latency
+    session: Path | None = None
+    exit_status: int = 0  # of the recorder
+    latency: str = ""
 
     def as_json(self) -> dict[str, str | None]:
-        """For JSON."""
-        return {"session": str(self.session) if self.session else None, "latency": self._latency}
+        return {"session": str(self.session) if self.session else None, "latency": self.latency}
 
     def show(self) -> None:
         """Print the chain of latency."""
-        if self._latency:
-            say(f"latency, median and (95 %): {self._latency}")
+        if self.latency:
+            say(f"latency, median and (95 %): {self.latency}")
 
 
 @verb("flowrec emulate lab", "flowrec emulate lab --fly a.mcap", "flowrec emulate lab --protocol first_day")

@@ -58,8 +58,8 @@ def emulated_lab(
     file: Path,
     camera_delay_s: float,
     sets: Iterable[str] | Mapping[str, Any],
-    overwrite: bool = False,
-    world: Iterable[str] | Mapping[str, Any] = (),
+    overwrite: bool,
+    world: Iterable[str] | Mapping[str, Any],
 ) -> Iterator[EmulatedLab]:
     """Camera, amplifier and world on this computer while the context lasts; `file` is written, and removed at the end.
 

@@ -19,20 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.core import (
-    NS_PER_S,
-    PICTURE,
-    Floats,
-    Frame,
-    Image,
-    Ints,
-    Track,
-    UsageError,
-    say,
-    seconds,
-    shift_px,
-    warn,
-)
+from flowrec.core import NS_PER_S, PICTURE, Floats, Frame, Image, Ints, Track, UsageError, say, seconds, shift_px, warn
 from flowrec.measure import write_picture
 from flowrec.rigs import MovieSource
 from flowrec.stages import (
@@ -177,7 +164,6 @@ def _numbered_places(number: str, image: Frame, p: Pipeline, config: ResolvedCon
 
 
 def _place_of_number(robot: str, places_px: Floats, image: Frame, asked: Config) -> tuple[float, float]:
-    """The place of a number of the picture."""
     number = int(robot)
     if not 1 <= number <= len(places_px):
         there = "is 1" if len(places_px) == 1 else f"are {len(places_px)}"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from flowrec.store import Column, Part, Session
 
 
-_PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
+_PNG_SIZE = struct.Struct(">II")  # width and height
 _PNG_SIZE_AT = 16  # bytes, after the signature and the head of the first part
 _STATED = ("seed", "world", "operator", "sample", "notes")  # in the provenance
 _OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance
@@ -48,7 +48,6 @@ class Facts(dict[str, Any]):
     columns: "dict[str, tuple[Column, ...]]"
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         tables = {name: [asdict(column) for column in columns] for name, columns in self.columns.items()}
         return {"session": str(self.path), "facts": self, "topics": self.topics} | (
             {"tables": tables} if tables else {}
@@ -173,7 +172,7 @@ def _piece(part: "Part", path: Path) -> str:
 
 
 def _chip(session: "Session") -> dict[str, Any]:
-    """Name, size and number of openings, which is None where nobody asked for a flow, see Chip.is_still."""
+    """Name, size and number of openings; the number is None if the chip is still, see Chip.is_still."""
     from flowrec.store import toml_table
 
     header = session.header

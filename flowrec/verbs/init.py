@@ -1,8 +1,8 @@
 """`flowrec init`: a configuration for a movie or a lab, with the chip in its images; asks for what is missing."""
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -45,7 +45,6 @@ class StartedConfig(NamedTuple):
     still: bool  # it is one image alone
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         return {name: str(value) if isinstance(value, Path) else value for name, value in self._asdict().items()}
 
     def lines(self) -> list[str]:
@@ -150,7 +149,9 @@ def init(
         chip.check()
     lab = source == LAB and not source.exists()
     subject = _lab_subject(given, out.parent, no_chip) if lab else _movie_subject(source, coils, given)
-    with _kept_on_success(subject.picture if lab else None):
+    with ExitStack() as on_failure:
+        if lab:  # the configuration that would name the picture of the camera is not written
+            on_failure.callback(subject.picture.unlink, missing_ok=True)
         inlet = [name for text in inlet or () for name in text.split(",")]
         of_chip = {} if no_chip or own_chip else {_INLET: inlet, _INLET_SPEED: inlet_speed_um_s}
         missing = _questions(subject) | {option: _OF_CHIP[option] for option, value in of_chip.items() if not value}
@@ -183,20 +184,10 @@ def init(
         head = f"# By flowrec init, for {source.name}. flowrec settings explains what else can be set.\n\n"
         with output.new_file() as part:
             part.write_text(head + commented_toml(config, changed_only=True), encoding="utf-8")
-        return StartedConfig(
-            source, out, None if own_chip else chip.path, coils, subject.timed, subject.picture, still=subject.still
-        )
-
-
-@contextmanager
-def _kept_on_success(picture: Path | None) -> Iterator[None]:
-    """Remove the picture of a camera unless the configuration that names it is written."""
-    try:
-        yield
-    except BaseException:
-        if picture is not None:
-            picture.unlink(missing_ok=True)
-        raise
+        on_failure.pop_all()
+    return StartedConfig(
+        source, out, None if own_chip else chip.path, coils, subject.timed, subject.picture, still=subject.still
+    )
 
 
 def _channel_of(picture: Path) -> "PictureChip":

@@ -71,12 +71,11 @@ class AtTerminal(Unattended):
     def end_on_signals(
         self, watchdog: Watchdog | None = None, give_up: Callable[[], str] = lambda: ""
     ) -> AbstractContextManager[None]:
-        handled: AbstractContextManager[None] = nullcontext()
-        if sys.platform != "win32":
-            from flowrec.run import Signals
+        if sys.platform == "win32":
+            return nullcontext()
+        from flowrec.run import Signals
 
-            handled = Signals(self.run_control, watchdog, give_up, lambda: self._leave_terminal()).handle()
-        return handled
+        return Signals(self.run_control, watchdog, give_up, lambda: self._leave_terminal()).handle()
 
     @contextmanager
     def show_run(self, writer: SessionWriter, disk: DiskMonitor) -> Iterator[Callable[[Tick], None]]:
@@ -140,7 +139,6 @@ class StatusLine:
                 thread.join(_CLOSE_TIMEOUT_S)
 
     def __call__(self, tick: Tick) -> None:
-        """Take one tick."""
         self._arrivals.append(time.perf_counter())
         if tick.timing is not None:
             self._latency_ms.append(tick.timing.total_ms)

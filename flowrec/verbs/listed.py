@@ -44,7 +44,6 @@ class ListedSession:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """All facts by name."""
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "facts"}
         return {**self.facts, **own}
 

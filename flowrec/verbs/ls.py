@@ -18,7 +18,6 @@ class Listing(list[ListedSession]):
     places: Sequence[Path]
 
     def as_json(self) -> list[dict[str, Any]]:
-        """For JSON."""
         return [row.as_json() for row in self]
 
     def show(self) -> None:

@@ -20,11 +20,9 @@ class Rows(tuple["ListedMethod", ...]):
     __slots__ = ()
 
     def as_json(self) -> list[dict[str, Any]]:
-        """For JSON."""
         return [asdict(row) for row in self]
 
     def show(self) -> None:
-        """Print them as a table."""
         from flowrec.core import table
 
         cells = [

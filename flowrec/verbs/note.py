@@ -20,7 +20,6 @@ class Notes(tuple["Note", ...]):
     added: bool
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         return {"session": str(self.path), "notes": [asdict(each) for each in self]}
 
     def lines(self) -> list[str]:

@@ -134,7 +134,7 @@ def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) ->
 
 
 def _refuse_unfit(asked: Config) -> None:
-    """Raise UsageError for settings that are none of a run, as `prepare` tells."""
+    """Raise UsageError for settings with which nothing can be run, see `prepare`."""
     if "recording" in SAMPLERS[asked.sampler.method].needs:
         able = " or ".join(f"'{row.name}'" for row in SAMPLERS.values() if "recording" not in row.needs)
         raise UsageError(

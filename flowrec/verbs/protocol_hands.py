@@ -119,13 +119,13 @@ def hand_of(answers: Iterable[str], *, asks: bool) -> ProtocolHand:
 
 
 def free_path(folder: Path, name: str, suffix: str) -> Path:
-    """A path that no file has: the name, or the name with a number; nor has the unfinished file of a session."""
+    """The name, or the name with a number: a path that neither a file nor the unfinished file of a session has."""
     numbered = (folder / f"{name}{f'_{number:03d}' if number > 1 else ''}{suffix}" for number in range(1, 10_000))
     return next(path for path in numbered if not path.exists() and not path.with_name(path.name + ".partial").exists())
 
 
 def _ask(question: str) -> str:
-    """The answer of a person; UsageError where the terminal is closed (Ctrl-D), which is none."""
+    """The answer of a person; UsageError if the terminal is closed (Ctrl-D)."""
     sys.stderr.write(question)
     sys.stderr.flush()
     line = sys.stdin.readline()

@@ -174,14 +174,13 @@ def record(
         read = [*inputs, Path(chosen.start.field)] if chosen.start.field else inputs
         Output(path, MCAP, tuple(read), overwrite).check()
     if dry_run:
-        from flowrec.verbs.doctor import look_at_lab
+        from flowrec.verbs.diagnosis import diagnose
+        from flowrec.verbs.doctor import Diagnosis
         from flowrec.verbs.preparation import prepare
 
         resolved = prepare(chosen).config
-        file = inputs[0] if inputs else None
-        return DryRun(
-            chosen if short else resolved, short, look_at_lab(chosen, file, path) if chosen.rig == "lab" else None
-        )
+        findings = diagnose(chosen, inputs[0] if inputs else None, path.parent if path is not None else None)
+        return DryRun(chosen if short else resolved, short, Diagnosis(findings) if chosen.rig == "lab" else None)
     from flowrec.store import refuse_unusable_key, sign_file
     from flowrec.verbs.mission_run import run_mission
 

@@ -89,7 +89,6 @@ class Recorded:
         return doubts_of(self.facts)
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         derived = {"derived": dict(self.derived), "files": [*map(str, self.files)]}
         return {"path": str(self.path), **self.facts, **derived}
 

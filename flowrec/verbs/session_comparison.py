@@ -158,7 +158,6 @@ class SessionComparison:
         return [*(part.name for part in self.head if part.differences), *lone, *dict.fromkeys(topics)]
 
     def as_json(self) -> dict[str, Any]:
-        """The result for JSON."""
         return self.comparison.as_json() | {
             "same": self.same,
             "identical": self.identical,
@@ -213,7 +212,7 @@ def _count_of(number: int, noun: str) -> str:
 
 
 def _same_bytes(first: Session, second: Session) -> int | None:
-    """The size of two sessions whose files are the same byte for byte; None of others."""
+    """The size of each of two sessions if their files are the same byte for byte; else None."""
     files = [[file.path for file in session.run.files] for session in (first, second)]
     sizes = [[file.size_bytes for file in session.run.files] for session in (first, second)]
     if sizes[0] != sizes[1]:

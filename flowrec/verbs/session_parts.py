@@ -130,12 +130,11 @@ def _of_header(header: SessionHeader, path: str) -> Iterator[tuple[str, Item]]:
         for key, value in flat(toml_table(text, f"{path}: {name} inside")):
             yield f"{name}.{key}", value
     yield "chip.mask", header.chip_png
-    for name, texts in (("provenance", header.provenance), ("parent", header.parent)):
-        for key, text in texts.items():
-            yield f"{name}.{key}", text
-    for name, files in (("weights", header.weights), ("pictures", header.pictures)):
-        for key, content in files.items():
-            yield f"{name}.{key}", content
+    tables: dict[str, Mapping[str, Item]] = {"provenance": header.provenance, "parent": header.parent}
+    tables |= {"weights": header.weights, "pictures": header.pictures}
+    for name, items in tables.items():
+        for key, item in items.items():
+            yield f"{name}.{key}", item
     yield "start", str(header.start_unix_ns)
 
 
@@ -156,7 +155,6 @@ class PartOfHead(NamedTuple):
     differences: Mapping[str, str]  # by item, what differs as text
 
     def line(self, width: int) -> str:
-        """A line of text."""
         if not self.differences:
             return printable(f"{self.name:{width}s}  identical")
         shown = [f"{key} {text}".strip() for key, text in self.differences.items()]
@@ -209,7 +207,6 @@ class RawTopic:
         self.hashes = array("Q")
 
     def add(self, log_ns: int, payload: bytes) -> None:
-        """Add a message."""
         self.log_ns.append(log_ns)
         self.hashes.append(int.from_bytes(hashlib.blake2b(payload, digest_size=8).digest(), "little"))
 

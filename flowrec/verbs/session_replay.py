@@ -222,7 +222,6 @@ class _Replay:
         )
 
     def _compare(self, tick: Tick) -> None:
-        """Take a tick of the replay."""
         control, recorded = self.control.run_control, self._rig.recorded
         if self._check is not None:  # it takes as long as the mission's slow stages did
             control.unless_stopped(partial(self._check.add, tick), None)

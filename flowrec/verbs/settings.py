@@ -19,11 +19,9 @@ class ExplainedSettings(tuple["SettingRow", ...]):
     __slots__ = ()
 
     def as_json(self) -> list[dict[str, Any]]:
-        """For JSON."""
         return [asdict(row) for row in self]
 
     def lines(self) -> list[str]:
-        """As text."""
         return [line for row in self for line in row.lines()]
 
 
@@ -31,11 +29,9 @@ class SettingSections(dict[str, str]):
     """Subjects of the sections of the settings, by name."""
 
     def as_json(self) -> dict[str, str]:
-        """For JSON."""
         return dict(self)
 
     def show(self) -> None:
-        """Print them as a table."""
         from flowrec.core import table
 
         table("Settings", ("section", "what it is about"), self.items(), text="what it is about")

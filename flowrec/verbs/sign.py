@@ -13,11 +13,9 @@ class Signed(list[Path]):
     """The signatures that were made, one for each file of the session."""
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON."""
         return {"signatures": [str(path) for path in self]}
 
     def lines(self) -> list[str]:
-        """A line for each."""
         return [f"{path} written" for path in self]
 
 

@@ -101,9 +101,9 @@ def refine(
 
     Raises
     ------
-    UsageError : measurements that are no such table, hold NaN, lie outside of the chip, all in solid or in fluid only
-        with y the other way up, or that are many times as fast as the map that the method finds; no such method; an
-        option outside of its range.
+    UsageError : no such method; an option outside of its range; measurements that are no such table or hold NaN, that
+        lie outside of the chip, all in solid, or in fluid only if y is turned over, or that are many times as fast as
+        the map that the method finds.
     ChipError, FlowError : as of `solve`.
     """
     solver = solver or FlowSolver()

@@ -57,7 +57,6 @@ class ClockTally:
         self._count = 0
 
     def add(self, message: Clocks) -> None:
-        """Count one message."""
         before, self.last = self.last, message
         jumps, set_s = (before.wall_jumps, before.wall_set_s) if before is not None else (0, 0.0)
         if message.wall_jumps > jumps and len(self.wall_set) < LISTED:
@@ -305,7 +304,6 @@ class Verdict:
         return [*lines, *(f"  {name:{width}s}  {text}" for name, text in self.facts.items())]
 
     def as_json(self) -> dict[str, Any]:
-        """The whole verdict for JSON."""
         content = asdict(self)
         del content["path"]
         head = {"session": str(self.path), "verdict": self.word, "exit_status": self.exit_status}

@@ -125,7 +125,7 @@ def _check_time(session: Path, time_s: float, screenshot: Path | None) -> None:
 
 
 def _recording(session: Path, beside: Path | None, out: Path | None, overwrite: bool) -> tuple[Path, list[str]]:
-    """The .rrd of a session, made if there is none of just these files; and a remark."""
+    """The .rrd of a session, made unless these files already have one; and a remark."""
     if session.suffix == ".rrd":
         return session, []
     from flowrec.exports import kept_rrd

@@ -25,7 +25,7 @@ from flowrec.store import Session, SessionReader
 from flowrec.verbs import session_replay as again
 from tests.conftest import HANG_S
 from tests.extras import why
-from tests.short_missions import LONG
+from tests.short_missions import LONG, set_words
 
 pytest.importorskip("playwright", reason=why("playwright"))
 CHROMIUM = next(
@@ -55,7 +55,7 @@ def browser() -> Iterator[Any]:
 @contextmanager
 def recorded(out: Path, *sets: str) -> Iterator[subprocess.Popen[str]]:
     """A run in real time with a console, while it lasts."""
-    words = [word for setting in sets for word in ("--set", setting)]
+    words = set_words(sets)
     command = [sys.executable, "-m", "flowrec", "record", "--realtime", "--console", "--out", str(out)]
     with subprocess.Popen([*command, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         yield process

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import Applied, Frame, SessionError, Tick, Tracers
+from flowrec.core import Applied, Frame, SessionError, Shift, Tick, Tracers
 from flowrec.exports import mp4
 from flowrec.exports.camera_images import with_images
-from flowrec.view import state_text
+from flowrec.view import Overlay, Scene, state_text
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 STAMPS_NS = [0, 33_333_333, 66_666_667, 500_000_001, 533_333_333]  # one interval is a loss
@@ -152,21 +152,26 @@ def test_the_robot_is_in_its_ring_and_nothing_is_drawn_over_it(session, tmp_path
         assert np.abs(red_over_blue[distance < radius - 3.0]).mean() < 15, "the camera's grey within it"
 
 
-def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_that_was_found(session):
-    from flowrec.view import Overlay, Scene
+def overlay_of(session) -> Overlay:
+    size_px = session.at(5.0).frame.image.shape[::-1]
+    return Overlay(Scene(session.chip, session.calibration, session.config.robot, "", image_px=size_px), size_px)
 
+
+def drawn(overlay: Overlay, tick: Tick, shape: tuple[int, int]) -> np.ndarray:
+    """The picture (3 h, 3 w, 3) over a grey image (h, w), without the lines below it."""
+    return overlay.draw(np.full(shape, 100, np.uint8), tick)[: 3 * shape[0]].astype(int)
+
+
+def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_that_was_found(session):
     tick = replace(session.at(5.0), estimate=None)
-    grey = np.full(tick.frame.image.shape, 100, np.uint8)
     moved_px = np.array([4.0, -2.0])  # of the camera: the chip lies that far from where the image shows it
     moved_um = session.config.camera.um_per_px * moved_px
     found = replace(tick.refined, registration=np.column_stack((np.eye(2), moved_um)))
-    pictures = []
-    for refined in (replace(tick.refined, registration=None), found):
-        scene = Scene(session.chip, session.calibration, session.config.robot, "", image_px=grey.shape[::-1])
-        overlay = Overlay(scene, grey.shape[::-1])
-        pictures.append(overlay.draw(grey, replace(tick, refined=refined))[: 3 * grey.shape[0]].astype(int))
+    stated, shown = (
+        drawn(overlay_of(session), replace(tick, refined=refined), tick.frame.image.shape)
+        for refined in (replace(tick.refined, registration=None), found)
+    )
     left, down = (3 * moved_px).astype(int)
-    stated, shown = pictures
     expected = np.roll(stated, (-down, -left), (0, 1))
     inside = np.s_[20:-20, 20:-20]
     assert np.abs(shown - stated)[inside].max() > 50
@@ -184,31 +189,22 @@ def two_tracers(session, stamp_ns: int) -> Tracers:
 
 
 def test_a_tracer_that_moves_has_a_line_to_where_it_will_be_soon_and_one_that_lies_still_has_none(session):
-    from flowrec.view import Overlay, Scene
-
     tick = Tick(stamp_ns=session.at(5.0).stamp_ns)
-    grey = np.full(session.at(5.0).frame.image.shape, 100, np.uint8)
-    overlay = Overlay(Scene(session.chip, session.calibration, session.config.robot, ""), grey.shape[::-1])
-    bare = overlay.draw(grey, tick)[: 3 * grey.shape[0]].astype(int)
-    drawn = overlay.draw(grey, replace(tick, tracers=two_tracers(session, tick.stamp_ns)))[: 3 * grey.shape[0]]
-    rows, columns = np.nonzero(np.abs(drawn.astype(int) - bare).max(axis=-1) > 20)
+    overlay, shape = overlay_of(session), session.at(5.0).frame.image.shape
+    bare = drawn(overlay, tick, shape)
+    shown = drawn(overlay, replace(tick, tracers=two_tracers(session, tick.stamp_ns)), shape)
+    rows, columns = np.nonzero(np.abs(shown - bare).max(axis=-1) > 20)
     assert rows.mean() / 3 == pytest.approx(30.0, abs=0.5)
     assert (columns.min() / 3, columns.max() / 3) == pytest.approx((60.0, 69.0), abs=1.0)  # the way of 0.3 s
 
 
 def test_route_goal_robot_and_tracers_are_where_a_shaken_image_shows_them(session):
-    from flowrec.core import Shift
-    from flowrec.view import Overlay, Scene
-
     at_rest = session.at(5.0)
     at_rest = replace(at_rest, shift=None, tracers=two_tracers(session, at_rest.stamp_ns))
-    grey = np.full(at_rest.frame.image.shape, 100, np.uint8)
     off_px = np.array([4.0, -2.0])
-    scene = Scene(session.chip, session.calibration, session.config.robot, "", image_px=grey.shape[::-1])
-    # One overlay draws both, as in a movie: the layer is drawn anew for the shift alone.
-    overlay = Overlay(scene, grey.shape[::-1])
+    overlay = overlay_of(session)  # one draws both, as in a movie: the layer is drawn anew for the shift alone
     rest, shaken = (
-        overlay.draw(grey, replace(at_rest, shift=shift))[: 3 * grey.shape[0]].astype(int)
+        drawn(overlay, replace(at_rest, shift=shift), at_rest.frame.image.shape)
         for shift in (None, Shift(at_rest.stamp_ns, off_px, found=True, alike=1.0))
     )
     right, down = (3 * off_px).astype(int)
@@ -232,8 +228,6 @@ def test_odd_sizes_are_made_even_and_deep_images_keep_the_scale_of_their_levels(
 
 @pytest.mark.parametrize("text", ["<script>alert(1)</script>", "\x1b[31mred\x1b[0m \u202eevil"])
 def test_a_sample_from_elsewhere_is_a_title_without_control_characters(text, session, tmp_path, monkeypatch):
-    from dataclasses import replace
-
     config = replace(session.config, recording=replace(session.config.recording, sample=text))
     monkeypatch.setitem(vars(session), "config", config)
     _, metadata, _ = read(written(mp4.Mp4Export(), OfTicks(session, made()), tmp_path / "x.mp4"))
@@ -242,8 +236,6 @@ def test_a_sample_from_elsewhere_is_a_title_without_control_characters(text, ses
 
 
 def test_a_session_without_images_or_with_regions_only_is_refused_in_one_line(session, tmp_path, monkeypatch):
-    from dataclasses import replace
-
     monkeypatch.setitem(vars(session), "topics", {})
     with pytest.raises(SessionError, match=r"golden\.mcap"):
         written(mp4.Mp4Export(), session, tmp_path / "x.mp4")

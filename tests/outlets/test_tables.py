@@ -171,8 +171,6 @@ def test_zarr_has_images_and_fields_with_axes_in_um(session: Session, exported: 
         np.testing.assert_allclose((here["x_um"], here["y_um"]), chip_um, rtol=1e-6)
         assert images["x_um"].attrs["units"] == images["y_um"].attrs["units"] == "um"
         assert frames.attrs["bits"] == p.BITS
-    import xarray
-
     with xarray.open_zarr(exported["zarr"], group="refined") as flow:
         check_dataset(flow)
 

@@ -34,8 +34,9 @@ from flowrec.stages.resolve import resolve
 from flowrec.store import SessionReader
 from flowrec.verbs import replay_session
 from tests.conftest import HANG_S
+from tests.short_missions import set_words
 from tests.twins.coils import Device, device
-from tests.twins.lab import COMMON, PATIENT, words
+from tests.twins.lab import COMMON, PATIENT
 
 RATE = "camera.rate_hz=25.0"
 MISSION = ("mission.check_axes=false", "chip.inlet_speed_um_s=5.0", "mission.wait_at_goal_s=100000")
@@ -66,7 +67,7 @@ def lab(folder: Path, out: Path) -> Iterator[tuple[str, Device, subprocess.Popen
         sets = (*sets, "lab.camera=opencv", f'lab.device="{images.url}"', *on.sets)
         command = [sys.executable, "-m", "flowrec", "record", "--rig", "lab", "--console", "--out", str(out)]
         with subprocess.Popen(
-            [*command, *words(sets)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [*command, *set_words(sets)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         ) as recorder:
             assert recorder.stdout is not None
             said = list[str]()

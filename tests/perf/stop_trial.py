@@ -26,7 +26,7 @@ from flowrec.run import loop
 from flowrec.stages import Inputs
 from flowrec.verbs import cli
 from flowrec.verbs import mission_run as verb
-from tests.short_missions import SMALL
+from tests.short_missions import SMALL, set_words
 
 AT = 40
 SETS = [*SMALL, "camera.rate_hz=60"]
@@ -191,7 +191,7 @@ def main(kind: str, out: str, log_path: str, *sets: str) -> None:
     if kind in STAGES:
         loop.step = failing  # type: ignore[assignment]
     verb.run_mission = logged  # type: ignore[assignment]
-    words = [word for setting in (*SETS, *sets) for word in ("--set", setting)]
+    words = set_words((*SETS, *sets))
     sys.argv = ["flowrec", "record", "--realtime", "--out", out, *words]
     cli.main()
 

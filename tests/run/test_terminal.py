@@ -19,9 +19,9 @@ import pytest
 
 from flowrec.store import SessionReader
 from tests.conftest import until
-from tests.short_missions import LONG
+from tests.short_missions import LONG, set_words
 
-WORDS = [word for setting in LONG for word in ("--set", setting)]
+WORDS = set_words(LONG)
 
 
 class Command:

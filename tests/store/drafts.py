@@ -160,7 +160,7 @@ def small_draft() -> Draft:
     pieces = tuple(
         Piece(tuple(sent[group][number])) for number in range(TICKS // TICKS_PER_CHUNK) for group in (FRAMES, STATE)
     )
-    outcome = text("flowrec.outcome") + _map({"outcome": "reached", "ticks": str(TICKS), "dropped_frames": "0"})
+    outcome = text("flowrec.outcome") + packed_map({"outcome": "reached", "ticks": str(TICKS), "dropped_frames": "0"})
     return Draft(head, pieces, ((METADATA, outcome),))
 
 
@@ -198,7 +198,7 @@ def _parts(records: list[Any]) -> Iterator[tuple[int, bytes]]:
         yield data[0], data[9:]
 
 
-def _map(pairs: dict[str, str]) -> bytes:
+def packed_map(pairs: dict[str, str]) -> bytes:
     data = b"".join(text(key) + text(value) for key, value in pairs.items())
     return struct.pack("<I", len(data)) + data
 

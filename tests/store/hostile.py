@@ -83,8 +83,3 @@ def saved(path, tmp_path):
     out = tmp_path / "saved.mcap"
     out.unlink(missing_ok=True)
     return recover(path, out)
-
-
-def packed_map(pairs):
-    data = b"".join(text(key) + text(value) for key, value in pairs.items())
-    return struct.pack("<I", len(data)) + data

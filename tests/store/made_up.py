@@ -1,5 +1,6 @@
 """Ticks of a made-up run: nothing in them means anything, everything in them is recorded."""
 
+import time
 from collections.abc import Iterator
 from dataclasses import fields, replace
 
@@ -17,12 +18,13 @@ from flowrec.core import (
     Observations,
     OperatorEvent,
     Route,
+    SessionError,
     Tick,
     Timing,
     Track,
     Truth,
 )
-from flowrec.store import SessionHeader, codec
+from flowrec.store import SessionHeader, SessionWriter, WriterOptions, codec
 from flowrec.store.channels import message_codec
 from flowrec.store.write_queue import Entry
 
@@ -102,6 +104,31 @@ def ticks_of(count: int, *, shape: tuple[int, int] = (48, 64), seed: int = 0, im
             news["operator"] = OperatorEvent(now, "note", "a: b")
         tick = replace(tick, stamp_ns=now, **news)
         yield tick
+
+
+def write_session(path, ticks, header=HEADER, outcome=None, **options):
+    """Write a session with these options; its path."""
+    with SessionWriter(path, header, WriterOptions(**({"block": True} | options))) as writer:
+        for tick in ticks:
+            writer.write(tick)
+        if outcome is not None:
+            writer.close(outcome)
+    return path
+
+
+def fails(writer, told, shape=(8, 8)):
+    """A writer whose file fails raises an error of one line while the run goes on, and again when it is closed."""
+    import pytest  # here, because processes that tests start do without it
+
+    def fly():
+        for tick in ticks_of(100_000, shape=shape):  # until the thread has told
+            writer.write(tick)
+            time.sleep(0.002)
+
+    for call in (fly, writer.close):
+        with pytest.raises(SessionError, match=told) as error:
+            call()
+        assert "\n" not in str(error.value)
 
 
 def same(one, other, but=()):

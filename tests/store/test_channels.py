@@ -3,18 +3,16 @@
 import pytest
 
 from flowrec.core import UsageError
-from flowrec.store import SessionReader, SessionWriter, WriterOptions
+from flowrec.store import SessionReader
 from flowrec.store.channels import VIEWED, left_out
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import ticks_of, write_session
 
 TICKS = list(ticks_of(60))
 
 
 def test_what_is_left_out_is_not_in_the_file_and_the_rest_is_unchanged(tmp_path):
     for name, patterns in (("all", ()), ("less", ("/view/*", "/truth/*", "/camera/frame"))):
-        with SessionWriter(tmp_path / f"{name}.mcap", HEADER, WriterOptions(block=True, leave_out=patterns)) as writer:
-            for tick in TICKS:
-                writer.write(tick)
+        write_session(tmp_path / f"{name}.mcap", TICKS, leave_out=patterns)
     everything, less = SessionReader(tmp_path / "all.mcap"), SessionReader(tmp_path / "less.mcap")
     gone = everything.counts.keys() - less.counts.keys()
     assert gone == everything.counts.keys() & {"frame", "truth", "true_field"} and "frame" in gone

@@ -9,7 +9,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from flowrec.core import SessionError
-from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
+from flowrec.store import SLOTS, SessionReader, recover
 from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, records_in
 from flowrec.store.mcap_reader import McapReader
@@ -18,7 +18,7 @@ from flowrec.store.session_file import SessionFile, Snapshot, Split
 from flowrec.store.session_metadata import DIGEST, OUTCOME
 from flowrec.store.viewer_scene import ViewerScene
 from flowrec.store.viewer_topics import ViewerTopics
-from tests.store.made_up import HEADER, START_UNIX_NS, ticks_of
+from tests.store.made_up import START_UNIX_NS, ticks_of, write_session
 from tests.store.test_damage import names_in
 from tests.store.test_recovery import DRAWN, chunks_of, cut, flush_every
 
@@ -26,14 +26,14 @@ FRAMES, TRACK = SLOTS["/camera/frame"].channel, SLOTS["/robot/track"].channel
 AT_END = (OUTCOME, DIGEST)
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 RUNS = {
-    "raw": WriterOptions(frames="raw", block=True),
-    "zstd": WriterOptions(frames="zstd", block=True),
-    "delta": WriterOptions(frames="delta", block=True),
-    "jpeg": WriterOptions(frames="jpeg", block=True),
-    "live": WriterOptions(frames="delta"),
-    "no views": WriterOptions(frames="zstd", block=True, leave_out=("/view/*",)),
-    "part": WriterOptions(frames="delta", block=True, files=Split(seconds=0.3)),
-    "snapshot": WriterOptions(frames="delta", block=True, files=Snapshot(0.2, 0.2)),
+    "raw": {"frames": "raw"},
+    "zstd": {"frames": "zstd"},
+    "delta": {"frames": "delta"},
+    "jpeg": {"frames": "jpeg"},
+    "live": {"frames": "delta", "block": False},
+    "no views": {"frames": "zstd", "leave_out": ("/view/*",)},
+    "part": {"frames": "delta", "files": Split(seconds=0.3)},
+    "snapshot": {"frames": "delta", "files": Snapshot(0.2, 0.2)},
 }
 
 
@@ -45,9 +45,7 @@ def files(tmp_path_factory):
         folder = tmp_path_factory.mktemp("copies")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(SessionFile, "flush_if_due", flush_every(3))
-            with SessionWriter(folder / "s.mcap", HEADER, options) as writer:
-                for tick in ticks_of(40, shape=(8, 8)):
-                    writer.write(tick)
+            write_session(folder / "s.mcap", ticks_of(40, shape=(8, 8)), **options)
         found[name] = sorted(folder.iterdir())[-1]
     return found
 

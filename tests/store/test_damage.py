@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from flowrec.core import Currents, SessionError
 from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, merged_chunks, session_metadata
 from flowrec.store.mcap_writer import McapWriter, new_mcap
 from tests.conftest import HANG_S
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, fails, ticks_of, write_session
 
 TICKS = list(ticks_of(30, shape=(8, 8)))
 
@@ -36,10 +35,7 @@ TICKS = list(ticks_of(30, shape=(8, 8)))
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     path = tmp_path_factory.mktemp("trouble") / "session.mcap"
-    with SessionWriter(path, HEADER) as writer:
-        for tick in TICKS:
-            writer.write(tick)
-    return path
+    return write_session(path, TICKS, block=False)
 
 
 def names_in(directory):
@@ -104,16 +100,7 @@ def test_a_full_or_broken_disk_is_told_at_the_next_write_and_at_close(tmp_path, 
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(McapWriter, "add_chunks", refuse)
-
-    def fly():
-        for tick in ticks_of(10_000, shape=(8, 8)):
-            writer.write(tick)
-            time.sleep(0.001)
-
-    for call in (fly, writer.close):
-        with pytest.raises(SessionError, match=told) as error:
-            call()
-        one_line(error)
+    fails(writer, told)
     assert not writer.path.exists() and writer.partial_path.exists()
 
 

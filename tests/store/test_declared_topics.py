@@ -46,7 +46,7 @@ from flowrec.store.channels import left_out
 from flowrec.store.run_files import snapshot_path
 from flowrec.store.session_file import Snapshot, Split
 from tests.store.drafts import made_up
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, ticks_of, write_session
 
 PATH = "/pump/pressure"
 DTYPES = ["float64", "float32", "uint8", "int64", "uint16"]
@@ -130,9 +130,12 @@ def test_any_declared_type_passes_file_and_table_bit_for_bit_and_needs_no_code(
     kind, sent = made
     topics = TopicTable([Topic("/lab/made", Source.RIG, type=kind)])
     path = tmp_path / "a.mcap"
-    with SessionWriter(path, HEADER, WriterOptions(block=True, overwrite=True, topics=topics)) as writer:
-        for message in sent:
-            writer.write(Tick(message.stamp_ns, extra=Extra({"/lab/made": message})))
+    write_session(
+        path,
+        (Tick(message.stamp_ns, extra=Extra({"/lab/made": message})) for message in sent),
+        overwrite=True,
+        topics=topics,
+    )
     with Session(path) as session:
         read = list(session.messages("/lab/made"))
         table = session.table("/lab/made")
@@ -175,9 +178,7 @@ def same_extra(one: Tick, other: Tick) -> bool:
 
 def recorded(path: Path, **options: Any) -> list[Tick]:
     ticks = list(sent_ticks())
-    with SessionWriter(path, HEADER, WriterOptions(block=True, topics=TOPICS, **options)) as writer:
-        for tick in ticks:
-            writer.write(tick)
+    write_session(path, ticks, topics=TOPICS, **options)
     return ticks
 
 

@@ -25,7 +25,7 @@ from flowrec.store.scan import scan
 from flowrec.store.segments import RecordingPlan
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
 from tests.conftest import HANG_S
-from tests.store.made_up import HEADER, PERIOD_NS, entry_of, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, entry_of, fails, ticks_of
 
 
 class GatedDisk:
@@ -268,16 +268,7 @@ def test_a_directory_that_disappears_ends_the_run(tmp_path):
     folder.mkdir()
     writer = SessionWriter(folder / "s.mcap", HEADER, WriterOptions(sync_s=0.2))
     shutil.rmtree(folder)
-
-    def fly():
-        for tick in ticks_of(100_000, shape=(8, 8)):
-            writer.write(tick)
-            time.sleep(0.005)
-
-    for call in (fly, writer.close):
-        with pytest.raises(SessionError, match=r"s\.mcap\.partial") as error:
-            call()
-        assert "\n" not in str(error.value)
+    fails(writer, r"s\.mcap\.partial")
 
 
 def test_a_directory_that_is_renamed_is_told_at_the_end_and_nothing_is_lost(tmp_path):

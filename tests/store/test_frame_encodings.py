@@ -22,11 +22,11 @@ from mcap.reader import make_reader
 from flowrec.core import PIXEL_BITS, Frame, RigError, SessionError, UsageError, pixel_type
 from flowrec.stages import load_config
 from flowrec.stages.config import Recording
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, codec, frames_of, recover
+from flowrec.store import SessionReader, codec, frames_of, recover
 from flowrec.store.frame_encodings import ENCODINGS, decode_image, encoding_for, row_differences
 from flowrec.store.schema import foxglove_schema
 from tests.conftest import HANG_S
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import ticks_of, write_session
 
 TICKS = list(ticks_of(30, shape=(47, 63)))
 LOSSLESS = [name for name, encoding in ENCODINGS.items() if encoding.lossless]
@@ -39,10 +39,7 @@ def there_and_back(frame, encoding):
 
 
 def record(path, frames, ticks=TICKS, **options):
-    with SessionWriter(path, HEADER, WriterOptions(frames=frames, block=True, **options)) as writer:
-        for tick in ticks:
-            writer.write(tick)
-    return path
+    return write_session(path, ticks, frames=frames, **options)
 
 
 def deeper(tick, bits):

@@ -33,20 +33,9 @@ from flowrec.stages import config_from_toml
 from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
 from tests.conftest import invoke
-from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, small_draft, text
-from tests.store.hostile import (
-    FRAMES,
-    STATE,
-    attached,
-    file_of,
-    packed_map,
-    refused,
-    saved,
-    with_head,
-    with_message,
-    with_piece,
-)
-from tests.store.made_up import HEADER, encode
+from tests.store.drafts import ATTACHMENT, CHANNEL, METADATA, PERIOD_NS, TICKS, made_up, packed_map, small_draft, text
+from tests.store.hostile import FRAMES, STATE, attached, file_of, refused, saved, with_head, with_message, with_piece
+from tests.store.made_up import HEADER, encode, write_session
 
 NAMES = ["../../x", "/etc/flowrec", "C:\\x", "weights/../../../x", "a\0b", "\x1b[2J"]
 
@@ -155,10 +144,9 @@ def spoiled(session, tmp_path, field, **changes):
     with as_read():
         other = replace(said, **{name: np.full_like(getattr(said, name), value) for name, value in changes.items()})
     path = tmp_path / "spoiled.mcap"
-    with SessionWriter(path, header, WriterOptions(block=True)) as writer:
-        for tick in ticks:
-            writer.write(replace(tick, **{field: other}) if getattr(tick, field) is said else tick)
-    return path
+    return write_session(
+        path, (replace(tick, **{field: other}) if getattr(tick, field) is said else tick for tick in ticks), header
+    )
 
 
 @pytest.mark.parametrize(

@@ -17,19 +17,19 @@ from flowrec.core import SessionError
 from flowrec.store import SessionReader, recover
 from flowrec.verbs.check import check
 from tests.conftest import invoke
-from tests.store.drafts import CHANNEL, CHUNK_INDEX, MESSAGE, METADATA, SCHEMA, TICKS, record, small_draft, text
-from tests.store.hostile import (
-    _CHUNK_OPCODE,
-    FRAMES,
-    STATE,
-    file_of,
+from tests.store.drafts import (
+    CHANNEL,
+    CHUNK_INDEX,
+    MESSAGE,
+    METADATA,
+    SCHEMA,
+    TICKS,
     packed_map,
-    refused,
-    saved,
-    with_head,
-    with_index,
-    with_piece,
+    record,
+    small_draft,
+    text,
 )
+from tests.store.hostile import _CHUNK_OPCODE, FRAMES, STATE, file_of, refused, saved, with_head, with_index, with_piece
 
 
 @pytest.mark.parametrize("crc", ["right", None])

@@ -20,7 +20,7 @@ from flowrec.store.session_file import SessionFile
 from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.compare import compare
-from tests.store.made_up import HEADER, same, ticks_of
+from tests.store.made_up import HEADER, same, ticks_of, write_session
 from tests.store.test_damage import KILLED, names_in
 
 TICKS = list(ticks_of(40, shape=(8, 8)))
@@ -33,11 +33,7 @@ def small(tmp_path_factory):
     path = tmp_path_factory.mktemp("recovery") / "small.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SessionFile, "flush_if_due", flush_every(3))
-        with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
-            for tick in TICKS:
-                writer.write(tick)
-            writer.close({"outcome": "reached", "note": "there"})
-    return path
+        return write_session(path, TICKS, outcome={"outcome": "reached", "note": "there"})
 
 
 def flush_every(ticks):
@@ -123,10 +119,7 @@ def test_a_last_tick_of_inputs_alone_is_not_taken_for_a_whole_one(tmp_path):
     # What a stage that failed leaves; then the file was cut before its end.
     last = replace(TICKS[5], **{name: getattr(TICKS[4], name) for name in OUTPUTS})
     path = tmp_path / "s.mcap"
-    with SessionWriter(path, HEADER, WriterOptions(frames="raw")) as writer:
-        for tick in (*TICKS[:5], last):
-            writer.write(tick)
-        writer.close({"outcome": "failed"})
+    write_session(path, (*TICKS[:5], last), block=False, frames="raw", outcome={"outcome": "failed"})
     footer_bytes = 9 + 20 + 8  # with the magic after it
     done = recover(cut(path, path.stat().st_size - footer_bytes, tmp_path / "t.mcap.partial"))
     ticks = list(SessionReader(done.path).ticks())

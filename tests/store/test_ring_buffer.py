@@ -18,7 +18,7 @@ from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.run_files import snapshot_path
 from flowrec.store.session_file import SessionFile, Snapshot
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of, write_session
 from tests.store.test_damage import names_in
 from tests.store.test_durability import slow_disk
 from tests.store.test_split import messages_in
@@ -72,10 +72,7 @@ def span_of(path):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("snapshots") / "whole.mcap"
-    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
-        for tick in with_events((400, ("mark", ""))):
-            writer.write(tick)
-    return path
+    return write_session(path, with_events((400, ("mark", ""))))
 
 
 @pytest.mark.parametrize("disk", [None, 1e6])

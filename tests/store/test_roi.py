@@ -7,7 +7,7 @@ import pytest
 
 from flowrec.core import UsageError
 from flowrec.stages import load_config
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, nonzero_window, recover
+from flowrec.store import SessionReader, nonzero_window, recover
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.roi import Region, WindowSelector
 from flowrec.verbs import Change
@@ -16,7 +16,7 @@ from flowrec.verbs.check import check
 from flowrec.verbs.info import info
 from flowrec.verbs.record import record
 from tests.short_missions import SMALL
-from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
+from tests.store.made_up import PERIOD_NS, ticks_of, write_session
 
 EVERYWHERE = (0, 0, 200, 160)
 REGION = Region(pad_px=5, everywhere_px=EVERYWHERE, full_every_s=0.5)
@@ -28,9 +28,7 @@ def seen_at(tick, roi, **more):
 
 
 def written(path, ticks, frames="zstd", block=True):
-    with SessionWriter(path, HEADER, WriterOptions(frames=frames, region=REGION, block=block)) as writer:
-        for tick in ticks:
-            writer.write(tick)
+    write_session(path, ticks, frames=frames, region=REGION, block=block)
     return SessionReader(path)
 
 

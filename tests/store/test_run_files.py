@@ -37,7 +37,7 @@ from flowrec.verbs.ls import ls
 from flowrec.verbs.record import record
 from tests.conftest import typed
 from tests.short_missions import SMALL
-from tests.store.made_up import same, ticks_of
+from tests.store.made_up import same, ticks_of, write_session
 
 TICKS = list(ticks_of(60, shape=(8, 8)))
 # What a simulator knows is in a tick only when it is new: the part after repeats less than was ever known.
@@ -63,12 +63,12 @@ def in_parts(path, cuts, ticks=SPARSE, header=None, outcome=None):
         part = Part("one run", number, keyframe_ns=None if carried is None else carried.stamp_ns)
         following = part_path(path, number + 1).name
         last = number == len(bounds) - 1
-        with SessionWriter(
-            part_path(path, number), replace(header or header_at_60_hz(), part=part), WriterOptions(block=True)
-        ) as writer:
-            for tick in [*([carried] if carried is not None else []), *ticks[begin:end]]:
-                writer.write(tick)
-            writer.close(outcome or {"outcome": "reached"} if last else {"outcome": "continued", "next": following})
+        write_session(
+            part_path(path, number),
+            [*([carried] if carried is not None else []), *ticks[begin:end]],
+            replace(header or header_at_60_hz(), part=part),
+            outcome=outcome or {"outcome": "reached"} if last else {"outcome": "continued", "next": following},
+        )
         files.append(part_path(path, number))
     return files
 
@@ -82,10 +82,7 @@ def news(ticks, before):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "x.mcap"
-    with SessionWriter(path, header_at_60_hz(), WriterOptions(block=True)) as writer:
-        for tick in SPARSE:
-            writer.write(tick)
-        writer.close({"outcome": "reached"})
+    write_session(path, SPARSE, header_at_60_hz(), outcome={"outcome": "reached"})
     return SessionReader(path)
 
 
@@ -184,10 +181,7 @@ def damage(run, what):
 def _rewritten(source, target, change):
     with SessionReader(source) as reader:
         header = replace(reader.header, part=change(reader.header.part))
-        with SessionWriter(target, header, WriterOptions(block=True, overwrite=True)) as writer:
-            for tick in reader.ticks():
-                writer.write(tick)
-            writer.close({"outcome": "continued"})
+        write_session(target, reader.ticks(), header, overwrite=True, outcome={"outcome": "continued"})
 
 
 @pytest.mark.parametrize(
@@ -283,10 +277,7 @@ def test_a_part_that_repeats_something_else_is_odd(run):
     with SessionReader(second) as reader:
         ticks = list(reader.ticks())
         ticks[0] = replace(ticks[0], estimate=replace(ticks[0].estimate, stamp_ns=5))
-        with SessionWriter(second, reader.header, WriterOptions(block=True, overwrite=True)) as writer:
-            for tick in ticks:
-                writer.write(tick)
-            writer.close(reader.outcome)
+        write_session(second, ticks, reader.header, overwrite=True, outcome=reader.outcome)
     verdict = check(run)
     assert verdict.exit_status == 3
     (finding,) = verdict.findings

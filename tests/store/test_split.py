@@ -25,7 +25,7 @@ from flowrec.store.run_files import run_files
 from flowrec.store.scan import scan
 from flowrec.store.segments import RecordingPlan
 from flowrec.store.session_file import Split
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, same, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, entry_of, fails, same, ticks_of, write_session
 from tests.store.test_damage import names_in
 from tests.store.test_durability import GatedDisk, slow_disk
 
@@ -195,16 +195,7 @@ def test_a_next_part_that_can_not_be_made_ends_the_run_and_leaves_whole_parts(tm
 
     monkeypatch.setattr(McapWriter, "__init__", refuse)
     writer = SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=Split(seconds=0.5)))
-
-    def fly():
-        for tick in ticks_of(100_000, shape=(96, 96)):  # until the thread has told
-            writer.write(tick)
-            time.sleep(0.002)
-
-    for call in (fly, writer.close):
-        with pytest.raises(SessionError, match=r"part003\.mcap\.partial: can not be made \(No space") as error:
-            call()
-        assert "\n" not in str(error.value)
+    fails(writer, r"part003\.mcap\.partial: can not be made \(No space", (96, 96))
     assert sorted(names_in(tmp_path)) == ["x.part001.mcap", "x.part002.mcap"]
     outcomes = [messages_in(piece)[1]["flowrec.outcome"] for piece in run_files(tmp_path / "x.mcap")]
     assert [outcome["outcome"] for outcome in outcomes] == ["continued", "failed"]
@@ -219,14 +210,8 @@ def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, m
         plain(self, sealed)
 
     monkeypatch.setattr(McapWriter, "add_chunks", refuse)
-
-    def fly():
-        with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=Split(seconds=1.0), block=True)) as writer:
-            for tick in TICKS:
-                writer.write(tick)
-
     with pytest.raises(SessionError, match=r"part002\.mcap\.partial: the disk is full"):
-        fly()
+        write_session(tmp_path / "x.mcap", TICKS, files=Split(seconds=1.0))
     assert sorted(names_in(tmp_path)) == ["x.part001.mcap", "x.part002.mcap.partial"]
     assert messages_in(part_path(tmp_path / "x.mcap", 1))[1]["flowrec.outcome"]["outcome"] == "continued"
     monkeypatch.undo()  # or what is recovered would fail as well

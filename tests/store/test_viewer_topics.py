@@ -12,13 +12,13 @@ from mcap.reader import make_reader
 
 from flowrec.core import Demand, Estimate, Mission, Observations, Route, Track, as_read
 from flowrec.physics import Calibration, on_chip, sample
-from flowrec.store import Session, SessionWriter, WriterOptions, nonzero_window
+from flowrec.store import Session, nonzero_window
 from flowrec.store.roi import region_from
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import Split
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.store.viewer_topics import VIEWER_TOPICS, ViewerTopics
-from tests.store.made_up import field_of
+from tests.store.made_up import field_of, write_session
 
 _SCHEMAS = {view.path: view.schema for view in VIEWER_TOPICS}
 START_NS = 1_790_000_000_000_000_000
@@ -213,10 +213,7 @@ def test_each_file_of_a_run_with_windows_of_images_shows_the_robot_inside_the_wi
     recorded = Session(session)
     ticks = list(recorded.ticks())[:60]
     cut = replace(region_from({"region": "robot", "pad_px": "4", "full_every_s": "100"}), cut=True)
-    options = WriterOptions(frames="zstd", block=True, region=cut, files=Split(seconds=0.8))
-    with SessionWriter(tmp_path / "a.mcap", recorded.header, options) as writer:
-        for tick in ticks:
-            writer.write(tick)
+    write_session(tmp_path / "a.mcap", ticks, recorded.header, region=cut, files=Split(seconds=0.8))
     files = sorted(tmp_path.glob("a.part*.mcap"))
     start_ns, stated, windows = recorded.header.start_unix_ns, recorded.calibration, 0
     assert len(files) > 1

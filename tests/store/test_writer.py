@@ -25,17 +25,13 @@ from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import Snapshot, Split
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from tests.conftest import HANG_S, until
-from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of, write_session
 
 TICKS = list(ticks_of(150))
 
 
 def record(path, ticks=TICKS, outcome=None, **options):
-    with SessionWriter(path, HEADER, WriterOptions(block=True, **options)) as writer:
-        for tick in ticks:
-            writer.write(tick)
-        writer.close(outcome or {"outcome": "reached"})
-    return path
+    return write_session(path, ticks, **options, outcome=outcome or {"outcome": "reached"})
 
 
 @pytest.fixture(scope="module")
@@ -242,9 +238,7 @@ def test_a_run_begins_at_the_time_of_its_first_tick_however_long_it_was_prepared
 
 def test_a_session_that_does_not_say_when_it_started_has_stamps_for_times(tmp_path):
     path = tmp_path / "old.mcap"
-    with SessionWriter(path, replace(HEADER, start_unix_ns=0), WriterOptions(block=True)) as writer:
-        for tick in TICKS[:20]:
-            writer.write(tick)
+    write_session(path, TICKS[:20], replace(HEADER, start_unix_ns=0))
     found, _ = seen_by_others(path)
     assert [time for time, _, _ in found["/robot/track"]] == [tick.stamp_ns for tick in TICKS[:20]]
     assert all(itertools.starmap(same, zip(TICKS[:20], SessionReader(path).ticks(), strict=True)))
@@ -358,19 +352,11 @@ def test_the_thread_of_a_live_run_is_never_behind_other_programs_and_in_real_tim
 
 def test_a_chunk_is_sealed_before_it_outgrows_what_a_reader_takes_and_no_message_may(tmp_path, monkeypatch):
     monkeypatch.setattr("flowrec.store.chunk._MESSAGE_LIMIT_BYTES", 100_000)
-    path, options = tmp_path / "x.mcap", WriterOptions(block=True, frames="raw", flush_s=100.0, sync_s=100.0)
-    with SessionWriter(path, HEADER, options) as writer:
-        for tick in ticks_of(12, shape=(200, 200)):  # images of 40 kB
-            writer.write(tick)
+    path = write_session(tmp_path / "x.mcap", ticks_of(12, shape=(200, 200)), frames="raw", flush_s=100.0, sync_s=100.0)
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     frames = next(number for number, each in summary.channels.items() if each.topic == "/camera/frame")
     chunks = [chunk for chunk in summary.chunk_indexes if frames in chunk.message_index_offsets]
     assert len(chunks) == 6 and all(80_000 < chunk.uncompressed_size < 101_000 for chunk in chunks)
-
-    def one(shape):
-        with SessionWriter(tmp_path / "y.mcap", HEADER, options) as other:
-            other.write(next(ticks_of(1, shape=shape)))
-
     with pytest.raises(SessionError, match=r"/camera/frame .*\d+ bytes"):
-        one((400, 300))
+        write_session(tmp_path / "y.mcap", ticks_of(1, shape=(400, 300)), frames="raw")

@@ -13,6 +13,7 @@ from flowrec.physics import load_chip
 from flowrec.rigs import SimulatedRig
 from flowrec.stages import assemble, load_config
 from flowrec.stages.resolve import resolve
+from tests.short_missions import set_words
 from tests.twins.coils import environment
 from tests.twins.emulator import showing
 
@@ -36,11 +37,6 @@ PATIENT = ("lab.guardian_s=1.0", "safety.guard_timeout_s=3.0", "lab.camera_timeo
 _STILLS = 20
 
 
-def words(sets: tuple[str, ...]) -> list[str]:
-    """As words of a command."""
-    return [word for text in sets for word in ("--set", text)]
-
-
 def still_scene(folder: Path) -> tuple[str, ...]:
     """Settings of an emulated camera that shows a robot at rest, with other noise in every image."""
     config = load_config(None, [*COMMON, "camera.rate_hz=40.0", "simulated.seed=5", "simulated.world=kind"])
@@ -56,7 +52,7 @@ def recorder(
     out: Path, *sets: str, module: str = "flowrec", cameras: int = 1, errors: Path | None = None
 ) -> Iterator[subprocess.Popen[str]]:
     """The recorder while it runs; it is killed at the end. `errors` takes its stderr, which is lost else."""
-    command = [sys.executable, "-m", module, "record", "--rig", "lab", "--out", str(out), *words(sets)]
+    command = [sys.executable, "-m", module, "record", "--rig", "lab", "--out", str(out), *set_words(sets)]
     with (errors or Path("/dev/null")).open("w") as stderr:
         process = subprocess.Popen(
             command,

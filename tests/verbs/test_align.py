@@ -101,12 +101,6 @@ def test_calibrate_motion_at_the_command_line_takes_another_log_on_another_clock
     assert "the log explains" in refused and refused.count("\n") == 1 and not (tmp_path / "b.toml").exists()
 
 
-@pytest.mark.slow("aligns a whole movie by its motion")
-def test_calibrate_motion_refuses_headings_that_are_not_those_of_the_run(imported: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="the log explains"):
-        calibrate_motion(imported, late_log(tmp_path / "other.csv", 0.0, heading=3.0))
-
-
 @pytest.mark.slow("imports a whole movie")
 def test_a_log_at_a_third_of_the_images_rate_is_aligned_as_samples_of_the_field(tmp_path: Path) -> None:
     log, out = late_log(tmp_path / "slow.csv", 0.1, every=3), tmp_path / "a.mcap"

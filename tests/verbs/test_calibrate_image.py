@@ -21,7 +21,7 @@ from flowrec.physics import Calibration
 from flowrec.stages import CameraSettings, load_config, with_sets
 from flowrec.verbs.record import record
 from tests.conftest import invoke
-from tests.short_missions import SMALL
+from tests.short_missions import SMALL, set_words
 
 POSE = ("angle_deg=182", "mirror=true", "centre_um=[3340,2350]", "um_per_px=20.4")
 TRUE = [f"simulated.{each}" for each in POSE]
@@ -36,7 +36,7 @@ def registration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture = next(iter(flowrec.open(record(load_config(None, sets), folder / "short.mcap").path).frames)).image
     cv2.imwrite(str(folder / "picture.png"), picture)
     words = ["calibrate", "image", str(folder / "picture.png"), "-o", str(folder / "registration.toml"), "--mirror"]
-    done = invoke(*words, *(word for each in (*CHIP, "camera.um_per_px=20") for word in ("--set", each)))
+    done = invoke(*words, *set_words((*CHIP, "camera.um_per_px=20")))
     assert done.exit_code == 0, done.output
     return folder / "registration.toml"
 

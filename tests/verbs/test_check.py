@@ -1,6 +1,5 @@
 """`flowrec check`: the verdict, and that it is the one that a person would come to."""
 
-import itertools
 import json
 import re
 import signal
@@ -18,8 +17,8 @@ from flowrec.core import CameraLosses, Ended, SessionError, Tick
 from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
 from tests.conftest import typed
-from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, packed_map, small_draft, text
+from tests.store.made_up import HEADER, ticks_of, write_session
 from tests.store.test_run_files import in_parts
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
@@ -43,8 +42,7 @@ def only(keep):
 
 
 def ending(**said):
-    pairs = b"".join(text(key) + text(value) for key, value in said.items())
-    return ((METADATA, text("flowrec.outcome") + struct.pack("<I", len(pairs)) + pairs),)
+    return ((METADATA, text("flowrec.outcome") + packed_map(said)),)
 
 
 def found(verdict):
@@ -167,9 +165,9 @@ def test_what_a_camera_has_lost_is_told_by_cause(tmp_path):
         CameraLosses(at_ns, *of)
         for at_ns, of in ((10**9, (10, 10, 0, 0, 0, 0, 0, 0)), (2 * 10**9, (90, 60, 3, 20, 0, 7, 2, 1)))
     ]
-    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
-        for number, tick in enumerate(ticks_of(20)):
-            writer.write(replace(tick, losses=losses[number >= 10]))
+    write_session(
+        tmp_path / "s.mcap", (replace(tick, losses=losses[number >= 10]) for number, tick in enumerate(ticks_of(20)))
+    )
     verdict = check(tmp_path / "s.mcap")
     assert re.findall(r"\d+", verdict.facts["losses"]) == ["90", "1", "0", "60", "3", "20", "7"]
     said = " ".join(text for _, text in found(verdict))
@@ -227,15 +225,8 @@ def test_how_a_run_ended_is_part_of_the_verdict(tmp_path):
 
 
 def test_a_configuration_that_is_not_understood_can_not_be_replayed(tmp_path):
-    verdict = check(_made_up(tmp_path))
+    verdict = check(write_session(tmp_path / "made_up.mcap", ticks_of(20, shape=(8, 8))))
     assert verdict.exit_status == 1 and verdict.findings[0].about == "head"
-
-
-def _made_up(tmp_path):
-    with SessionWriter(tmp_path / "made_up.mcap", HEADER, WriterOptions(block=True)) as writer:
-        for tick in itertools.islice(ticks_of(20, shape=(8, 8)), 20):
-            writer.write(tick)
-    return tmp_path / "made_up.mcap"
 
 
 def test_a_track_at_the_border_is_doubted_also_where_the_session_states_no_doubt(tmp_path):

@@ -39,13 +39,13 @@ def test_help_is_asked_for_in_short(words: list[str]) -> None:
     assert invoke(*words, "-h").output == invoke(*words, "--help").output != ""
 
 
-def test_the_help_of_replay_and_export_names_every_method_of_every_table() -> None:
+def test_the_help_of_replay_and_export_lists_every_method_of_every_table_with_its_summary() -> None:
     helps = [invoke(verb, "--help", env={"COLUMNS": "200"}).output for verb in ("replay", "export")]
     shown = " ".join("".join(helps).split())
     for target in (*REPLAYED.values(), "flowrec.exports.formats:EXPORTS"):
         module, _, table = target.partition(":")
-        for name in getattr(importlib.import_module(module), table):
-            assert f"{name}: " in shown
+        for name, method in getattr(importlib.import_module(module), table).items():
+            assert f"{name}: {method.summary}" in shown
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,12 @@ import pytest
 from flowrec.core import Demand, Ended, FlowField, Tick, as_read
 from flowrec.core.topics import topics_of
 from flowrec.stages import load_config, to_toml
-from flowrec.store import SessionHeader, SessionWriter, WriterOptions
+from flowrec.store import SessionHeader
 from flowrec.verbs.compare import compare
 from flowrec.verbs.comparison import Comparison
 from tests.conftest import answered
 from tests.rewritten import edit_of_head, rewrite
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, ticks_of, write_session
 
 NAN, INF = float("nan"), float("inf")
 
@@ -78,10 +78,7 @@ def small_session(path: Path, ticks: list[Tick], parent: bool = False, sets: tup
     parents = {"file": "a.mcap", "sha256": ""} if parent else {}
     config = load_config(None, sets)
     header = SessionHeader(to_toml(config), HEADER.chip_png, HEADER.chip_toml, HEADER.provenance, parents)
-    with SessionWriter(path, header, WriterOptions(block=True, leave_out=config.recording.leave_out)) as writer:
-        for tick in ticks:
-            writer.write(tick)
-    return path
+    return write_session(path, ticks, header, leave_out=config.recording.leave_out)
 
 
 @pytest.fixture

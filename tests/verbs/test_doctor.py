@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flowrec.core import CameraLosses
-from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, ChipSettings, Orientation, load_chip
+from flowrec.physics import AS_STATED, ORIENTATIONS, Calibration, Chip, ChipSettings, Orientation, load_chip
 from flowrec.rigs import CameraInfo
 from flowrec.rigs.lab.cameras import probe as camera
 from flowrec.stages import Config, load_config, registration_of, with_sets
@@ -22,6 +22,7 @@ from flowrec.verbs import diagnosis
 from flowrec.verbs.diagnosis import FAILURE, OK, WARNING, diagnose
 from tests.conftest import invoke
 from tests.physics.chip.looks import LOOKS, picture
+from tests.short_missions import set_words
 
 MEASURED = (
     "rig=lab",
@@ -48,6 +49,13 @@ SEEN = camera.CameraProbe(
 def short_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk is tried with 4 MB."""
     monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+
+
+def sees(monkeypatch: pytest.MonkeyPatch, chip: Chip, camera_at: Calibration) -> None:
+    """The camera shows dark walls of the chip, in an image of 320 x 256 pixels."""
+    image = picture(chip.mask, chip.um_per_px, camera_at, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
+    info = replace(SEEN.info, width_px=320, height_px=256)
+    monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
 
 
 def levels(config: Config, folder: Path) -> dict[str, str]:
@@ -86,16 +94,20 @@ def test_what_a_camera_shows_is_judged(
     assert levels(config, tmp_path)[what] == level
 
 
+def test_a_camera_that_states_no_name_is_called_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nameless = replace(SEEN, info=replace(SEEN.info, model="", serial=""))
+    monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: nameless)
+    found = diagnose(load_config(None, [*MEASURED, "mission.phases=observe"]), folder=tmp_path)
+    assert next(one for one in found if one.what == "camera").text.startswith("camera: 640 x 512 pixels")
+
+
 @pytest.mark.parametrize(("turned_deg", "level"), [(0.0, OK), (1.0, WARNING)])
 def test_a_chip_that_was_turned_since_its_registration_is_noticed(
     turned_deg: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chip = load_chip(ChipSettings())
     centre_um = (np.array(chip.size_um) - chip.um_per_px) / 2
-    truth = Calibration.centre_on(20.0, centre_um, (320, 256), turned_deg)
-    image = picture(chip.mask, chip.um_per_px, truth, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
-    info = replace(SEEN.info, width_px=320, height_px=256)
-    monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
+    sees(monkeypatch, chip, Calibration.centre_on(20.0, centre_um, (320, 256), turned_deg))
     sets = ["camera.width_px=320", "camera.height_px=256", "mission.phases=observe"]
     assert levels(load_config(None, [*MEASURED, *sets]), tmp_path)["walls"] == level
 
@@ -114,10 +126,7 @@ def test_a_camera_that_shows_the_chip_in_another_orientation_is_a_failure_with_t
     asked = ["chip.path=sessions/chips/y_junction.png", "camera.width_px=320", "camera.height_px=256"]
     config = load_config(None, [*MEASURED, *asked, "mission.phases=observe"])
     chip = load_chip(config.chip)
-    true = orientation.about(registration_of(resolve(config, chip).camera, chip), (159.5, 127.5))
-    image = picture(chip.mask, chip.um_per_px, true, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
-    info = replace(SEEN.info, width_px=320, height_px=256)
-    monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
+    sees(monkeypatch, chip, orientation.about(registration_of(resolve(config, chip).camera, chip), (159.5, 127.5)))
     axes = {one.what: one for one in diagnose(config, folder=tmp_path)}["axes"]
     assert (axes.level == OK) == (orientation == AS_STATED)
     sets = [each.replace(" ", "") for each in axes.text.partition(": set ")[2].split(", ") if each]
@@ -138,17 +147,23 @@ def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path) -> Non
     assert levels(load_config(), tmp_path)["kernels"] == OK
 
 
-def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(tmp_path: Path) -> None:
-    sets = [*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
-    words = ["doctor", "--json", "--folder", str(tmp_path), *(word for text in sets for word in ("--set", text))]
+def without_devices(folder: Path, *sets: str) -> tuple[dict[str, str], set[str]]:
+    """Failures of a lab whose camera and amplifier are missing, and all that was looked at."""
+    asked = (*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing", *sets)
+    words = ["doctor", "--json", "--folder", str(folder), *set_words(asked)]
     done = invoke(*words)
-    assert done.exit_code == 1
+    assert done.exit_code == 1, done.output
     found = json.loads(done.stdout)
-    assert found["level"] == "failure"
-    failures = {one["what"]: one["text"] for one in found["findings"] if one["level"] == "failure"}
+    assert found["level"] == FAILURE
+    failures = {one["what"]: one["text"] for one in found["findings"] if one["level"] == FAILURE}
+    assert "nowhere.avi" in failures["camera"] and "/dev/nothing" in failures["coils"], sets
+    return failures, {one["what"] for one in found["findings"]}
+
+
+def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(tmp_path: Path) -> None:
+    failures, looked_at = without_devices(tmp_path)
     assert set(failures) == {"camera", "coils"}
-    assert "nowhere.avi" in failures["camera"] and "/dev/nothing" in failures["coils"]
-    assert {"settings", "mission", "disk", "viewer"} <= {one["what"] for one in found["findings"]}
+    assert {"settings", "mission", "disk", "viewer"} <= looked_at
     assert not list(tmp_path.iterdir())
 
 
@@ -176,7 +191,6 @@ def test_a_registration_is_judged_by_its_age_and_its_residual(
 
 
 def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_same(tmp_path: Path) -> None:
-    devices = ["lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
     for wrong, text in {
         "robot.radius_um=-5.0": "robot.radius_um = -5",
         "camera.bits=9": "camera.bits = 9",
@@ -184,14 +198,8 @@ def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_s
         "mission.goal=[1e6, 0.0]": "goal",
         "lab.devise=7": "lab.devise",
     }.items():
-        sets = [*MEASURED, *devices, wrong]
-        words = ["doctor", "--json", "--folder", str(tmp_path), *(word for each in sets for word in ("--set", each))]
-        done = invoke(*words)
-        assert done.exit_code == 1, done.output
-        failures = {one["what"]: one["text"] for one in json.loads(done.stdout)["findings"] if one["level"] == FAILURE}
+        failures, _ = without_devices(tmp_path, wrong)
         assert text in failures["settings"], wrong
-        assert "nowhere.avi" in failures["camera"], wrong
-        assert "/dev/nothing" in failures["coils"], wrong
 
 
 def test_settings_that_are_not_measured_are_a_failure_that_names_them() -> None:

@@ -15,9 +15,9 @@ import pytest
 import flowrec
 from flowrec.core import OutputError, SessionError, UsageError
 from flowrec.exports import EXPORTS
-from flowrec.store import SessionWriter, WriterOptions
 from flowrec.verbs.view import view
 from tests.conftest import invoke
+from tests.store.made_up import write_session
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
@@ -33,11 +33,7 @@ def any_export(request: pytest.FixtureRequest) -> str:
 def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first ticks of the golden session: what is made of it again and again need not be long."""
     path, session = tmp_path_factory.mktemp("brief") / "brief.mcap", flowrec.open(GOLDEN)
-    with SessionWriter(path, session.header, WriterOptions(block=True)) as writer:
-        for tick in islice(session.ticks(), 10):
-            writer.write(tick)
-        writer.close({"outcome": "stopped"})
-    return path
+    return write_session(path, islice(session.ticks(), 10), session.header, outcome={"outcome": "stopped"})
 
 
 def test_the_ending_of_an_output_names_its_format_and_one_that_names_none_is_asked_for(
@@ -78,12 +74,6 @@ def test_an_export_replaces_an_earlier_export_of_the_same_session_and_no_other_f
         made.write_bytes(b"precious")
         with pytest.raises(OutputError, match="exists already"):
             flowrec.export(session, file_format=any_export)
-
-
-def test_the_help_of_export_lists_every_format_with_its_summary(any_export: str) -> None:
-    shown = invoke("export", "--help", env={"COLUMNS": "200"}).stdout
-    words = " ".join(shown.split())
-    assert f"{any_export}: {EXPORTS[any_export].summary}" in words
 
 
 def test_an_unknown_format_is_an_error_that_names_the_formats(tmp_path: Path) -> None:

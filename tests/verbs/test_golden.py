@@ -21,7 +21,9 @@ from flowrec.core import NUMERICS_VERSION, UM_PER_M
 from flowrec.physics import Scales, System, system
 from flowrec.store import SessionReader
 from flowrec.verbs import Change
-from flowrec.verbs import session_replay as verb
+from flowrec.verbs.comparison import Comparison
+from flowrec.verbs.replay_result import Replay
+from flowrec.verbs.session_replay import replay_session
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 MODERATE = GOLDEN.with_name("golden_moderate.mcap")
@@ -37,52 +39,47 @@ def test_a_golden_session_is_small_and_says_nothing_of_the_machine_it_was_made_o
     assert not {"host", "user", "platform", "git_diff"} & set(facts)
 
 
-@pytest.mark.parametrize("from_s", [None, 3.0])
-def test_the_golden_session_replays_the_same_but_for_the_meaning_of_its_fields(from_s: float | None) -> None:
-    done = verb.replay_session(GOLDEN, Change(), from_s=from_s, verify=True)
+def verified(path: Path, from_s: float | None = None) -> tuple[Replay, Comparison, list[str]]:
+    """A replay whose ticks are those of the recording; the comparison of the worker's results, and what is printed."""
+    done = replay_session(path, Change(), from_s=from_s, verify=True)
     lines = done.lines()
     assert done.comparison.same and done.digest[0], lines
+    assert done.recorded.mission is not None and done.recorded.mission.outcome == "reached"
+    assert done.worker is not None
+    return done, done.worker.comparison, lines
+
+
+@pytest.mark.parametrize("from_s", [None, 3.0])
+def test_the_golden_session_replays_the_same_but_for_the_meaning_of_its_fields(from_s: float | None) -> None:
+    done, comparison, lines = verified(GOLDEN, from_s)
     not_recorded = done.as_json()["not_recorded"]  # is not compared
     assert not_recorded["/run/mission held_ns"] == "not recorded in golden.mcap"
-    assert done.worker is not None
-    different = {path for path, count in done.worker.comparison.topics.items() if count.different}
+    different = {path for path, count in comparison.topics.items() if count.different}
     assert different == (BY_OTHER_NUMERICS if from_s is None else set()), lines
-    routes = done.worker.comparison.topics["/plan/route"]
+    routes = comparison.topics["/plan/route"]
     assert routes.identical + routes.within_tolerance == (2 if from_s is None else 1)
     if different:
         assert not done.same
         assert "the same within tolerance; results of the worker made by other numerics" in lines[-1]
-    assert done.recorded.mission is not None
-    assert done.recorded.mission.outcome == "reached"
 
 
 def test_the_golden_session_of_the_moderate_world_replays_the_same_but_for_what_newer_numerics_find() -> None:
-    done = verb.replay_session(MODERATE, Change(), verify=True)
-    lines = done.lines()
-    assert done.comparison.same and done.digest[0], lines
-    assert done.worker is not None
-    different = {path for path, count in done.worker.comparison.topics.items() if count.different}
+    _, comparison, lines = verified(MODERATE)
+    different = {path for path, count in comparison.topics.items() if count.different}
     assert different <= {"/plan/route", "/flow/refined"}, lines  # by the survey and by the refinement
     versions = f"(recorded: version 3, replayed: version {NUMERICS_VERSION})"
     assert f"results of the worker made by other numerics {versions}" in lines[-1]
-    routes = done.worker.comparison.topics["/plan/route"]
+    routes = comparison.topics["/plan/route"]
     assert routes.identical + routes.within_tolerance > 0  # the way to the goal in the recorded map
-    assert done.recorded.mission is not None
-    assert done.recorded.mission.outcome == "reached"
 
 
 @pytest.mark.parametrize(("path", "walls"), [(SETTLED, "smooth"), (TRACED, "grey")])
 def test_a_golden_session_of_the_settled_format_is_intact_and_replays_the_same(path: Path, walls: str) -> None:
-    done = verb.replay_session(path, Change(), verify=True)
+    done, _, lines = verified(path)
     assert done.session.chip.walls == walls
-    lines = done.lines()
-    assert done.comparison.same and done.digest[0], lines
     assert "consistent with their digest" in " ".join(lines)
-    assert done.worker is not None
     recorded = done.session.header.provenance["numerics_version"]
     assert done.same or recorded != str(NUMERICS_VERSION), lines  # the slow results, too
-    assert done.recorded.mission is not None
-    assert done.recorded.mission.outcome == "reached"
 
 
 @pytest.mark.parametrize("path", [GOLDEN, MODERATE])

@@ -21,15 +21,15 @@ from flowrec.verbs import read_each
 from flowrec.verbs.ls import ls
 from flowrec.verbs.view import view as view_session
 from tests.conftest import HANG_S, typed
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, ticks_of, write_session
 
 
 def write(path: Path, count: int, **figures: float) -> Path:
-    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
-        for tick in ticks_of(count, shape=(8, 8)):
-            writer.write(tick)
-        writer.close({"outcome": "reached", **{key: repr(value) for key, value in figures.items()}})
-    return path
+    return write_session(
+        path,
+        ticks_of(count, shape=(8, 8)),
+        outcome={"outcome": "reached", **{key: repr(value) for key, value in figures.items()}},
+    )
 
 
 @pytest.fixture(scope="module")

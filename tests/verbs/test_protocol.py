@@ -21,7 +21,7 @@ from flowrec.verbs.protocol import FAILED, NOT_DONE, PASSED, RESULTS, DayProtoco
 from flowrec.verbs.protocol_hands import Answers, EmulatedHand, Person
 from flowrec.verbs.protocol_rows import ROWS, RowValue
 from tests.conftest import needs_quiet, run
-from tests.short_missions import SMALL
+from tests.short_missions import SMALL, set_words
 from tests.twins.coils import needs_compiler
 from tests.twins.lab import PATIENT
 
@@ -170,7 +170,7 @@ def test_on_a_simulated_rig_all_that_needs_no_instrument_passes_and_the_session_
     folder = tmp_path / "day"
     sets = [*SMALL, "simulated.tracers=60", "mission.check_axes=true"]
     words = ["doctor", "--protocol", "--folder", folder, "--answer", MOUNTED, "--json"]
-    words += [word for each in sets for word in ("--set", each)]
+    words += set_words(sets)
     assert run(words) == 3
     told = json.loads(capsys.readouterr().out)
     found = {row["row"]: row["result"] for row in told["rows"]}
@@ -200,7 +200,7 @@ def test_a_defect_of_the_simulated_world_fails_the_row_that_is_for_it(
 ) -> None:
     sets = [*SMALL, "camera.um_per_px=20", "robot.delay_s=0.04", "simulated.tracers=60", "mission.check_axes=true"]
     words = ["doctor", "--protocol", "--folder", tmp_path, "--answer", MOUNTED, "--json", "--only", row]
-    assert run([*words, *(word for each in [*sets, f"simulated.{WORLDS[row]}"] for word in ("--set", each))]) == 1
+    assert run([*words, *set_words([*sets, f"simulated.{WORLDS[row]}"])]) == 1
     found = {each["row"]: each for each in json.loads(capsys.readouterr().out)["rows"]}
     assert found[row]["result"] == FAILED and found[row]["value"] is not None, found[row]
     assert {each["result"] for name, each in found.items() if name != row} == {NOT_DONE}
@@ -263,7 +263,7 @@ def run_protocol(folder: Path, words: list[str], capsys: pytest.CaptureFixture[s
     """The result of each row on the emulated lab."""
     sets = ["simulated.world=kind", "simulated.tracers=60", "recording.accept_losses=true", *PATIENT]
     command = ["emulate", "lab", "-o", folder / "lab.toml", "--protocol", folder / "day", "--json", *words]
-    run([*command, *(word for each in sets for word in ("--set", each))])
+    run([*command, *set_words(sets)])
     printed = capsys.readouterr()
     print(printed.err)
     return {row["row"]: row["result"] for row in json.loads(printed.out)["rows"]}

@@ -20,19 +20,9 @@ import flowrec
 from flowrec.archive.push import PushedFile, push
 from flowrec.archive.verbs import push as push_verb
 from flowrec.core import Ended, FlowrecError, StoppedError, UsageError
-from flowrec.store import (
-    TRAFFIC,
-    Session,
-    SessionWriter,
-    UrlPath,
-    WriterOptions,
-    bucket_upload,
-    part_path,
-    remote_file,
-    session_sha256,
-)
+from flowrec.store import TRAFFIC, Session, UrlPath, bucket_upload, part_path, remote_file, session_sha256
 from tests.conftest import HANG_S, invoke, until
-from tests.store.made_up import ticks_of
+from tests.store.made_up import ticks_of, write_session
 from tests.store.s3_server import BUCKET, KEYS, S3Server, s3_server
 from tests.store.test_run_files import header_at_60_hz, in_parts
 
@@ -53,10 +43,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session that is sent in several parts."""
     path = tmp_path_factory.mktemp("large") / "large.mcap"
-    with SessionWriter(path, header_at_60_hz(), WriterOptions(block=True, frames="raw")) as writer:
-        for tick in ticks_of(60, shape=(540, 540)):
-            writer.write(tick)
-        writer.close({"outcome": "reached"})
+    write_session(path, ticks_of(60, shape=(540, 540)), header_at_60_hz(), frames="raw", outcome={"outcome": "reached"})
     assert LARGE_PARTS - 1 < path.stat().st_size / PART_BYTES < LARGE_PARTS
     return path
 

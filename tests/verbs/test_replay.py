@@ -18,6 +18,7 @@ from flowrec.verbs import Change, replay_segments
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.compare import compare
 from flowrec.verbs.record import record
+from flowrec.verbs.replay_result import Replay
 from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
 
@@ -179,14 +180,17 @@ def test_planted_hidden_state_passes_from_the_start_and_is_caught_from_the_middl
     assert resumed.comparison.first.topic == "/robot/estimate"
 
 
+def flow_errors(done: Replay) -> list[float]:
+    """Errors of the assumed and of the refined flow of a replay, against the recorded truth."""
+    truth, maps = done.recorded.true_field, (done.replayed.assumed, done.replayed.refined)
+    return [relative_rmse(each, truth, done.session.chip.mask).v for each in maps]
+
+
 def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp_path: Path) -> None:
     done = verb.replay_session(session, Change(refine="assimilate"), out=tmp_path / "refined.mcap")
-    assert done.recorded.true_field is not None
-    assert done.replayed.assumed is not None
-    assert done.replayed.refined is not None
-    before = relative_rmse(done.replayed.assumed, done.recorded.true_field, done.session.chip.mask).v
-    after = relative_rmse(done.replayed.refined, done.recorded.true_field, done.session.chip.mask).v
+    before, after = flow_errors(done)
     assert after < 0.5 * before
+    assert done.replayed.refined is not None
     written = SessionReader(tmp_path / "refined.mcap")
     assert written.header.parent["file"] == session.name
     assert written.header.start_unix_ns == SessionReader(session).header.start_unix_ns > 0
@@ -197,14 +201,11 @@ def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp
 def test_a_replay_can_refine_with_what_the_smoother_sees_in_hindsight(session: Path) -> None:
     smoothed = Change(refine="assimilate", sets=("sampler.method=smoothed",))
     done = verb.replay_session(session, smoothed)
-    assert (
-        done.recorded.true_field is not None and done.replayed.assumed is not None and done.replayed.refined is not None
-    )
-    before = relative_rmse(done.replayed.assumed, done.recorded.true_field, done.session.chip.mask).v
-    assert relative_rmse(done.replayed.refined, done.recorded.true_field, done.session.chip.mask).v < 0.3 * before
+    before, after = flow_errors(done)
+    assert after < 0.3 * before
     # No later than the work order itself, and other observations than the filter's.
     filtered = verb.replay_session(session, Change(refine="assimilate"))
-    assert filtered.replayed.refined is not None
+    assert filtered.replayed.refined is not None and done.replayed.refined is not None
     assert not done.replayed.refined.same_as(filtered.replayed.refined)
     with pytest.raises(UsageError, match="needs observer"):
         verb.replay_session(session, replace(smoothed, observer="luenberger"))

@@ -22,11 +22,11 @@ from flowrec.exports import MEANINGS, PathFigure, RecordingFigure, ReportData, T
 from flowrec.exports.report import page as pages
 from flowrec.exports.report.curves import BUCKETS, CurveBuilder
 from flowrec.exports.report.explanations import OUTCOMES
-from flowrec.store import SessionWriter, WriterOptions
 from flowrec.verbs import report_page as command
 from flowrec.view import ColourScale
 from flowrec.view.colours import Table
 from tests.conftest import invoke, made_once
+from tests.store.made_up import write_session
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
 GOLDEN, MODERATE = SESSIONS / "golden.mcap", SESSIONS / "golden_moderate.mcap"
@@ -60,11 +60,12 @@ def part_of(path: Path, out: Path, ticks: int, texts: Mapping[str, str] | None =
     """The first ticks of a session, with other texts in its provenance and other messages in each tick."""
     session = flowrec.open(path)
     header = replace(session.header, provenance={**session.provenance, **(texts or {})})
-    with SessionWriter(out, header, WriterOptions(block=True)) as writer:
-        for tick in islice(session.ticks(), ticks):
-            writer.write(replace(tick, **changed))  # type: ignore[arg-type]
-        writer.close({"outcome": "stopped", "note": (texts or {}).get("notes", "")})
-    return out
+    return write_session(
+        out,
+        (replace(tick, **changed) for tick in islice(session.ticks(), ticks)),
+        header,
+        outcome={"outcome": "stopped", "note": (texts or {}).get("notes", "")},
+    )
 
 
 @pytest.fixture(scope="session")

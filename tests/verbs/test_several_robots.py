@@ -21,7 +21,7 @@ from flowrec.verbs.compare import compare
 from flowrec.verbs.preparation import prepare
 from tests.conftest import answered
 from tests.rewritten import leaves_of, rewrite
-from tests.short_missions import SMALL
+from tests.short_missions import SMALL, set_words
 
 SEVERAL = [*SMALL, "simulated.robots=3", "tracker.robots=3", "simulated.seed=4"]
 IMPORTED = ["mission.check_axes=false", "refine.assimilate.doubt_depth=false", "recording.own_process=false"]
@@ -30,7 +30,7 @@ OBSERVED = [robot_topic("/robot/observations", number) for number in (1, 2)]
 
 
 def recorded(path: Path, *sets: str) -> Path:
-    chosen = [word for each in (*SEVERAL, *sets) for word in ("--set", each)]
+    chosen = set_words((*SEVERAL, *sets))
     status, said = answered("record", *chosen, "--duration", 1.5, "--out", path)
     assert status == 0, said
     return path

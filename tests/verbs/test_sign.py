@@ -9,13 +9,12 @@ from pathlib import Path
 import pytest
 
 from flowrec.core import FlowrecError, OutputError
-from flowrec.store import SessionWriter, WriterOptions
 from flowrec.store.session_file import Split
 from flowrec.verbs.check import check
 from flowrec.verbs.record import record
 from flowrec.verbs.sign import sign
 from tests.short_missions import SMALL
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import ticks_of, write_session
 
 pytestmark = pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="OpenSSH is not installed")
 
@@ -32,13 +31,6 @@ def signers_of(*keys: Path) -> Path:
     return listed
 
 
-def session_of(folder: Path, options: WriterOptions, ticks: int = 60) -> Path:
-    with SessionWriter(folder / "a.mcap", HEADER, options) as writer:
-        for tick in ticks_of(ticks):
-            writer.write(tick)
-    return writer.path
-
-
 @pytest.fixture
 def keys(tmp_path: Path) -> tuple[Path, Path]:
     folder = tmp_path / "keys"
@@ -46,11 +38,11 @@ def keys(tmp_path: Path) -> tuple[Path, Path]:
     return key_of(folder, "ada"), key_of(folder, "eve")
 
 
-@pytest.mark.parametrize("options", [WriterOptions(), WriterOptions(files=Split(seconds=0.4))])
+@pytest.mark.parametrize("options", [{}, {"files": Split(seconds=0.4)}])
 def test_a_signed_session_is_intact_and_its_signer_is_named(
-    tmp_path: Path, keys: tuple[Path, Path], options: WriterOptions
+    tmp_path: Path, keys: tuple[Path, Path], options: dict[str, Split]
 ) -> None:
-    path, (ada, eve) = session_of(tmp_path, options), keys
+    path, (ada, eve) = write_session(tmp_path / "a.mcap", ticks_of(60), **options), keys
     before = check(path, signers=signers_of(ada, eve))
     assert before.integrity == "consistent, unsigned"
     made = sign(path, ada)
@@ -64,7 +56,7 @@ def test_a_signed_session_is_intact_and_its_signer_is_named(
 
 
 def test_what_was_edited_or_signed_by_others_is_not_intact(tmp_path: Path, keys: tuple[Path, Path]) -> None:
-    path, (ada, eve) = session_of(tmp_path, WriterOptions()), keys
+    path, (ada, eve) = write_session(tmp_path / "a.mcap", ticks_of(60)), keys
     sign(path, eve)
     stranger = check(path, signers=signers_of(ada))
     assert stranger.integrity == "consistent, unsigned" and "does not name" in stranger.findings[-1].text
@@ -72,7 +64,7 @@ def test_what_was_edited_or_signed_by_others_is_not_intact(tmp_path: Path, keys:
     (made,) = sign(path, ada, overwrite=True)
     signature = made.read_bytes()
     # A file whose digest agrees: only the signature tells that it is another one.
-    session_of(tmp_path, WriterOptions(overwrite=True), 59)
+    write_session(path, ticks_of(59), overwrite=True)
     assert not made.exists() and check(path).integrity == "consistent, unsigned"
     made.write_bytes(signature)
     forged = check(path, signers=signers_of(ada))
@@ -81,7 +73,7 @@ def test_what_was_edited_or_signed_by_others_is_not_intact(tmp_path: Path, keys:
 
 @pytest.mark.parametrize("limit", ['namespaces="git"', 'valid-before="20200101"'])
 def test_a_key_signs_only_what_its_list_allows(tmp_path: Path, keys: tuple[Path, Path], limit: str) -> None:
-    path, (ada, _) = session_of(tmp_path, WriterOptions()), keys
+    path, (ada, _) = write_session(tmp_path / "a.mcap", ticks_of(60)), keys
     sign(path, ada)
     listed = signers_of(ada)
     listed.write_text(listed.read_text().replace("ada@lab ", f"ada@lab {limit} "))
@@ -91,7 +83,7 @@ def test_a_key_signs_only_what_its_list_allows(tmp_path: Path, keys: tuple[Path,
 def test_a_signature_is_not_replaced_and_a_wrong_key_or_list_is_refused(
     tmp_path: Path, keys: tuple[Path, Path]
 ) -> None:
-    path, (ada, eve) = session_of(tmp_path, WriterOptions()), keys
+    path, (ada, eve) = write_session(tmp_path / "a.mcap", ticks_of(60)), keys
     sign(path, ada)
     with pytest.raises(OutputError, match="exists already"):
         sign(path, eve)

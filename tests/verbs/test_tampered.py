@@ -33,7 +33,7 @@ from flowrec.core import (
 from flowrec.physics import load_chip
 from flowrec.stages import load_config
 from flowrec.stages.resolve import resolve
-from flowrec.store import SessionWriter, WriterOptions, digest_faults, session_header
+from flowrec.store import SessionHeader, digest_faults, session_header
 from flowrec.store.session_file import Split
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.verbs.check import check
@@ -41,13 +41,19 @@ from flowrec.verbs.compare import compare
 from tests.conftest import answered
 from tests.rewritten import EDITS, leaves_of, parser_of, rewrite
 from tests.short_missions import SMALL
-from tests.store.made_up import ticks_of
+from tests.store.made_up import ticks_of, write_session
 
 AGAIN = pytest.mark.slow("verifies a mission again")
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 PATHS = [topic.path for topic in TOPICS]
 VIEWS = [mirror.path for mirror in VIEWER_TOPICS if mirror.schema.wire is not None]
+
+
+def header() -> SessionHeader:
+    config = load_config(None, SMALL)
+    chip = load_chip(config.chip)
+    return session_header(resolve(config, chip), chip)
 
 
 def every_topic() -> list[Tick]:
@@ -80,13 +86,7 @@ def every_topic() -> list[Tick]:
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of a few kilobytes with a message of each topic; the stages have nothing to do with it."""
     path = tmp_path_factory.mktemp("small") / "small.mcap"
-    config = load_config(None, SMALL)
-    chip = load_chip(config.chip)
-    header = session_header(resolve(config, chip), chip)
-    with SessionWriter(path, header, WriterOptions(block=True)) as writer:
-        for tick in every_topic():
-            writer.write(tick)
-    return path
+    return write_session(path, every_topic(), header())
 
 
 def digest_findings(path: Path) -> list[str]:
@@ -151,11 +151,7 @@ def test_an_edit_is_a_difference_and_check_never_says_more_than_it_knows(
 
 
 def test_one_pixel_of_a_large_image_is_under_the_digest(tmp_path: Path) -> None:
-    config = load_config(None, SMALL)
-    header = session_header(config, load_chip(config.chip))
-    with SessionWriter(tmp_path / "large.mcap", header, WriterOptions(block=True, frames="raw")) as writer:
-        for tick in ticks_of(2, shape=(300, 400)):
-            writer.write(tick)
+    write_session(tmp_path / "large.mcap", ticks_of(2, shape=(300, 400)), header(), frames="raw")
 
     def edit(channel: Any, message: Any, wire: Any) -> bool:
         if channel.topic != "/camera/frame" or message.sequence:
@@ -338,11 +334,7 @@ def test_what_verify_prints_of_a_file_has_its_control_characters_escaped(tmp_pat
 
 
 def test_each_part_of_a_run_has_a_digest_of_its_own(tmp_path: Path) -> None:
-    config = load_config(None, SMALL)
-    header = session_header(config, load_chip(config.chip))
-    with SessionWriter(tmp_path / "run.mcap", header, WriterOptions(block=True, files=Split(seconds=0.1))) as writer:
-        for tick in every_topic():
-            writer.write(tick)
+    write_session(tmp_path / "run.mcap", every_topic(), header(), files=Split(seconds=0.1))
     parts = sorted(tmp_path.glob("run.part*.mcap"))
     assert len(parts) > 1
     for part in parts:

@@ -128,7 +128,7 @@ def find(where: str = "", catalog: Path | None = None, sort: str = "", limit: in
 
 @contextmanager
 def open_catalog(path: Path) -> Iterator[tuple[About, SessionTable]]:
-    """Context with what a catalog states of itself, and its sessions; UsageError if it is none or of another format."""
+    """Context with what a catalog states of itself, and its sessions; UsageError: no catalog, or of another format."""
     with connect() as connection:
         try:
             about = _about(connection, path)

@@ -1,6 +1,6 @@
 """Scan of a catalog's places: sessions with all their files, and the fingerprints that show whether they have changed.
 
-Folders are searched with all folders below them, but for those that are hidden: file servers keep old versions there.
+Folders are searched with all folders below them. Hidden folders are left out: file servers keep old versions there.
 Nothing is opened, so ten thousand files take a fraction of a second. A folder in a bucket is listed without those below
 it, a thousand objects a request.
 """

@@ -43,11 +43,9 @@ class Refreshed:
     remarks: tuple[str, ...] = ()  # lines about what could not be used
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
         return asdict(self) | {"path": str(self.path), "remarks": list(self.remarks)}
 
     def lines(self) -> list[str]:
-        """For people."""
         same = self.sessions - self.new - self.changed
         counts = {
             f"{self.new} new": self.new,

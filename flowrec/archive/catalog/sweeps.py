@@ -69,7 +69,7 @@ def lists_of(contents: Sequence[str | None], rows: pa.Table) -> tuple[pa.ListArr
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
-    """The rows of the table of a sweep by column, with their settings as one text; none of another table."""
+    """The rows of the table of a sweep by column, with their settings as one text; [] if it is another table."""
     with open_bytes(path) as source:
         if source.size > _LIMIT_BYTES:
             raise SessionError(f"{path}: is larger than the table of a sweep")

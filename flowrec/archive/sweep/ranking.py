@@ -109,7 +109,6 @@ class Ranking:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """The ranking in numbers."""
         return {
             "figure": self.figure,
             "sessions": self.sessions,

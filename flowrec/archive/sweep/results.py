@@ -171,7 +171,7 @@ class Results:
 def read_rows(path: Path) -> list[Row]:
     """The rows of a sweep's file, as its tasks returned them.
 
-    Raises SessionError: there is no such file, or it can not be read; OutputError: it is none of `flowrec sweep`.
+    Raises SessionError: there is no such file, or it can not be read; OutputError: `flowrec sweep` has not written it.
     """
     try:
         table = pq.read_table(path, partitioning=None)

@@ -57,7 +57,6 @@ class CurveBuilder:
         self._rows: dict[int, tuple[int, float, float, float, float]] = {}  # number, time, mean, low, high by bucket
 
     def add(self, stamp_ns: int, value: float) -> None:
-        """Take a value."""
         if not math.isfinite(value):
             return
         at = min(max(int((stamp_ns - self._first_ns) * self._per_ns), 0), BUCKETS - 1)
@@ -89,7 +88,7 @@ class Span:
 
 
 class SpanBuilder:
-    """Takes the states of successive ticks; '' is none. No more than _MOST_SPANS are kept."""
+    """Takes the states of successive ticks; '' means no state. No more than _MOST_SPANS are kept."""
 
     def __init__(self) -> None:
         self.spans: list[Span] = []

@@ -125,7 +125,6 @@ class History:
         return self._builders.get(name, CurveBuilder(self.first_ns, self.last_ns)).curve()
 
     def add(self, tick: Tick) -> None:
-        """Take the next tick."""
         before, self.last = self.last, tick.at_images(self.last)
         tick = self.last
         self.ticks += 1

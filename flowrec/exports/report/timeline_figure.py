@@ -107,7 +107,7 @@ class TimelineFigure:
 
 
 def numbered_actions(remarks: Sequence[Remark]) -> list[tuple[str, Remark]]:
-    """The actions of the operator with their numbers; the end of a movie is none."""
+    """The actions of the operator with their numbers; the end of a movie is not counted."""
     actions = [remark for remark in remarks if remark.action and remark.action != Action.END]
     return [(str(number), remark) for number, remark in enumerate(actions, 1)]
 

@@ -24,29 +24,28 @@ from flowrec.archive.catalog.format import KEY, NAME
 from flowrec.archive.sweep.results import Results
 from flowrec.archive.sweep.tasks import Task, content_of
 from flowrec.core import FlowrecError, OperatorEvent, OutputError, SessionError, UsageError, open_new
-from flowrec.store import Session, SessionWriter, WriterOptions
+from flowrec.store import Session, SessionWriter
 from flowrec.store.session_file import Split
 from flowrec.verbs import columns_of
 from flowrec.verbs.ls import ls
 from tests.conftest import HANG_S, typed
 from tests.extras import needs
 from tests.rewritten import rewrite
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, ticks_of, write_session
 from tests.store.s3_server import BUCKET, s3_server
 
 PROVENANCE = {"operator": "Zoë", "wall_time": "2026-05-04T10:00:00+00:00"}
 
 
-def made_up(path: Path, number: int, marks: int = 0, options: WriterOptions | None = None, **figures: Any) -> Path:
+def made_up(path: Path, number: int, marks: int = 0, split_s: float | None = None, **figures: Any) -> Path:
     """A session of its own content, with marks by the operator and figures in its outcome."""
     header = replace(HEADER, provenance=PROVENANCE | {"seed": str(number)}, start_unix_ns=number)
-    with SessionWriter(path, header, options or WriterOptions(block=True)) as writer:
-        for count, tick in enumerate(ticks_of(12, shape=(8, 8), seed=number)):
-            event = OperatorEvent(tick.stamp_ns, "mark", f"bubble {count}") if count < marks else None
-            writer.write(replace(tick, operator=event))
-        outcome = {"outcome": "reached"} | {key: str(value) for key, value in figures.items()}
-        writer.close(outcome)
-    return path
+    ticks = [
+        replace(tick, operator=OperatorEvent(tick.stamp_ns, "mark", f"bubble {count}") if count < marks else None)
+        for count, tick in enumerate(ticks_of(12, shape=(8, 8), seed=number))
+    ]
+    outcome = {"outcome": "reached"} | {key: str(value) for key, value in figures.items()}
+    return write_session(path, ticks, header, outcome, files=Split(seconds=split_s))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +55,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "may" / ".snapshots").mkdir(parents=True)
     first = made_up(folder / "a.mcap", 1, marks=2, refined_flow_error=0.03, contacts=3, ticks=12)
     made_up(folder / "may" / "b.mcap", 2, refined_flow_error=0.12, contacts=1, ticks=12, tracking_error="2 um rms")
-    made_up(folder / "may" / "run.mcap", 3, options=WriterOptions(block=True, files=Split(seconds=0.1)))
+    made_up(folder / "may" / "run.mcap", 3, split_s=0.1)
     shutil.copy(first, folder / "may" / "copy.mcap")
     shutil.copy(first, folder / "may" / ".snapshots" / "old.mcap")
     (folder / "cut.mcap").write_bytes(first.read_bytes()[:-2000])

@@ -28,21 +28,16 @@ from flowrec.archive.sweep.replay_process import replay_task
 from flowrec.archive.sweep.results import Results, read_rows
 from flowrec.archive.sweep.tasks import Sessions, Task, change_of, combinations, content_of, session_files
 from flowrec.core import FlowrecError, OutputError, UsageError
-from flowrec.store import SessionWriter, WriterOptions
 from flowrec.verbs import refinement_remarks
 from tests.archive.sweep.rows import row_of
 from tests.conftest import invoke
-from tests.store.made_up import HEADER, ticks_of
+from tests.store.made_up import HEADER, ticks_of, write_session
 
 GRID = ["refine=fvm,gain"]
 
 
 def made_up_session(path: Path, ticks: int, **header: Any) -> Path:
-    with SessionWriter(path, replace(HEADER, **header), WriterOptions(block=True)) as writer:
-        for tick in ticks_of(ticks, shape=(8, 8)):
-            writer.write(tick)
-        writer.close({"outcome": "reached"})
-    return path
+    return write_session(path, ticks_of(ticks, shape=(8, 8)), replace(HEADER, **header), outcome={"outcome": "reached"})
 
 
 # --- what is swept

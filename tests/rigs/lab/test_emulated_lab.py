@@ -32,8 +32,9 @@ from flowrec.store import Session
 from flowrec.verbs import replay_session
 from tests.conftest import needs_quiet, run, until
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, currents
+from tests.short_missions import set_words
 from tests.twins.coils import needs_compiler
-from tests.twins.lab import PATIENT, words
+from tests.twins.lab import PATIENT
 
 SIZE = {"width_px": 64, "height_px": 48, "rate_hz": 40.0}
 
@@ -230,7 +231,7 @@ def test_a_mission_on_the_emulated_lab_arrives_states_its_latency_and_gives_back
         "--fly",
         str(session),
     ]
-    command += ["--camera-delay-ms", str(1e3 * delay_s), "--set", "refine.method=gain", *words(PATIENT)]
+    command += ["--camera-delay-ms", str(1e3 * delay_s), "--set", "refine.method=gain", *set_words(PATIENT)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=400.0, check=False)
     said = done.stdout + done.stderr
     assert done.returncode in (0, 3), said[-2000:]

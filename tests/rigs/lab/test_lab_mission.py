@@ -27,10 +27,11 @@ from flowrec.verbs.check import check
 from tests.conftest import feeds_an_output, needs_quiet, run
 from tests.extras import why
 from tests.perf.camera_killed import trial
+from tests.short_missions import set_words
 from tests.twins.coils import Device, device
 from tests.twins.emulator import emulated
 from tests.twins.gige import installed
-from tests.twins.lab import COMMON, PATIENT, RATE, recorder, words
+from tests.twins.lab import COMMON, PATIENT, RATE, recorder
 from tests.twins.world import EmulatedView
 
 pytestmark = [needs_quiet, feeds_an_output]
@@ -172,7 +173,7 @@ def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_f
     out.mkdir()
     with emulated(cameras), device(kind, tmp_path) as on, meanwhile(on) as more:
         begin = on.end()
-        given = words((*COMMON, RATE, "lab.camera=pylon", *on.sets, *more, *sets))
+        given = set_words((*COMMON, RATE, "lab.camera=pylon", *on.sets, *more, *sets))
         status = run(["record", "--rig", "lab", "--out", out / "s.mcap", *given])
         assert not on.energised(begin)
     assert status in (1, 2)

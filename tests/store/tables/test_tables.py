@@ -28,7 +28,7 @@ from flowrec.store import Session, SessionWriter, WriterOptions, columns_of
 from flowrec.store.tables import Tables
 from tests.store.drafts import made_up
 from tests.store.hostile import STATE, file_of, with_message
-from tests.store.made_up import HEADER, encode
+from tests.store.made_up import HEADER, encode, write_session
 
 GOLDEN = Path(__file__).parents[3] / "sessions" / "golden.mcap"
 
@@ -123,9 +123,13 @@ def test_a_table_of_other_than_three_coils_has_a_numbered_column_a_coil_and_one_
                 assert [table[name][1].as_py() for name in columns] == (2.0 * given[:coils]).tolist()
                 assert table.schema == session.schema(topic)
             assert session.table("currents")["voltages_v"].to_pylist()[1] == (2.0 * given[:coils]).tolist()
-    with SessionWriter(tmp_path / "a.mcap", HEADER, WriterOptions(block=True)) as writer:
-        for stamp_ns, coils in ((1, 3), (2, 2), (3, 4)):
-            writer.write(Tick(stamp_ns, applied=Applied(stamp_ns, 1.0, 0.0, 1.0, given[:coils], np.zeros(2))))
+    write_session(
+        tmp_path / "a.mcap",
+        (
+            Tick(stamp_ns, applied=Applied(stamp_ns, 1.0, 0.0, 1.0, given[:coils], np.zeros(2)))
+            for stamp_ns, coils in ((1, 3), (2, 2), (3, 4))
+        ),
+    )
     with pytest.raises(SessionError, match="/coils/applied: currents_a has not 3 numbers in each message"):
         flowrec.open(tmp_path / "a.mcap").table("applied")
 
