@@ -101,13 +101,13 @@ def _between_walls(known: Robot, p: Pipeline, sphere: SphereBetweenWalls, refine
 def _slip_um_s(
     p: Pipeline, sphere: SphereBetweenWalls, point_um: Floats, refined: FlowField, flow: FlowField
 ) -> Floats | None:
-    """Velocity (2,) by which the flow carries a sphere otherwise than the fluid; None: the refinement has not said.
+    """Velocity (2,) by which the flow carries a sphere otherwise than the fluid; None: the refinement has found none.
 
     The refinement states a fraction of what the laws of sphere_between_walls.py give: its mean, significant or not,
-    because its prior says more than that a robot has no size.
+    because a robot of some size lags. A negative one has another cause: walls do not hurry a robot.
     """
     share = refined.parameter("sphere_share")
-    if share is None:
+    if share is None or share[0] <= 0.0:
         return None
     here, *around = sample(flow, point_um + p.robot.radius_um * np.vstack([np.zeros((1, 2)), _AROUND]))
     return np.asarray(share[0] * (np.mean(around, axis=0) - (1.0 + sphere.lag[0]) * here))

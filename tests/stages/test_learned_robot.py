@@ -22,9 +22,9 @@ def duct() -> Pipeline:
     return assemble(resolve(asked, chip), chip)
 
 
-def at(duct: Pipeline, point_um: np.ndarray, **changed: bool) -> LearnedRobot:
+def at(duct: Pipeline, point_um: np.ndarray, found: float = FOUND, **changed: bool) -> LearnedRobot:
     """The robot at a point (2,), by a refinement that found a part of the lag of a sphere."""
-    flow = replace(duct.solver.solve(duct.chip), parameter_names="sphere_share", parameters=np.array([FOUND]))
+    flow = replace(duct.solver.solve(duct.chip), parameter_names="sphere_share", parameters=np.array([found]))
     flow = replace(flow, parameter_std=np.array([0.4]))
     estimate = Estimate(0, point_um, np.zeros(2), np.eye(4), 0.0, point_um, True)
     refiner = replace(duct.refiner, **changed)
@@ -45,6 +45,7 @@ def test_a_flow_carries_a_sphere_by_faxens_law_less_the_lag_beside_the_walls(duc
     expected = -FOUND * (a**2 / 6.0 * 8.0 * peak / width**2 + lag * speed)
     assert at(duct, point).slip_um_s == pytest.approx([expected, 0.0], abs=0.04 * abs(expected))
     assert at(duct, point, correct_lag=False).slip_um_s is None
+    assert at(duct, point, found=-0.2).slip_um_s is None, "walls do not hurry a robot"
 
 
 def test_what_moves_the_robot_and_what_is_ordered_hold_the_slip_once(duct) -> None:
