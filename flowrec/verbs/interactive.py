@@ -71,11 +71,12 @@ class AtTerminal(Unattended):
     def end_on_signals(
         self, watchdog: Watchdog | None = None, give_up: Callable[[], str] = lambda: ""
     ) -> AbstractContextManager[None]:
-        if sys.platform == "win32":
-            return nullcontext()
-        from flowrec.run import Signals
+        handled: AbstractContextManager[None] = nullcontext()
+        if sys.platform != "win32":
+            from flowrec.run import Signals
 
-        return Signals(self.run_control, watchdog, give_up, lambda: self._leave_terminal()).handle()
+            handled = Signals(self.run_control, watchdog, give_up, lambda: self._leave_terminal()).handle()
+        return handled
 
     @contextmanager
     def show_run(self, writer: SessionWriter, disk: DiskMonitor) -> Iterator[Callable[[Tick], None]]:
