@@ -8,21 +8,34 @@ fluid.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
-from flowrec.core import Applied, Estimate, Floats, FlowField, Tick, bilinear
-from flowrec.physics import Robot, SphereBetweenWalls, on_chip, sample
+from flowrec.core import Applied, Estimate, Floats, Floats32, FlowField, Tick, bilinear
+from flowrec.physics import ChannelWidths, Chip, Robot, SphereBetweenWalls, on_chip, sample
 from flowrec.stages.control.tracking_laws import limit_length
-
-if TYPE_CHECKING:
-    from flowrec.stages.pipeline import Pipeline
+from flowrec.stages.refine import Refiner
 
 # Radii from the centre to four points around it: the mean of the flow there is v + a^2 / 6 lap v, which carries the
 # sphere (Faxen 1922).
 _FAXEN_RADII = float(np.sqrt(2.0 / 3.0))
 _AROUND = _FAXEN_RADII * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+
+
+class Swimming(Protocol):
+    """The robot as it is stated, in its chip, and what of a refinement corrects it; a Pipeline has all of them."""
+
+    @property
+    def chip(self) -> Chip: ...
+    @property
+    def robot(self) -> Robot: ...
+    @property
+    def clearance_um(self) -> Floats32: ...
+    @property
+    def widths(self) -> ChannelWidths: ...
+    @property
+    def refiner(self) -> Refiner: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +68,7 @@ class LearnedRobot:
         return wanted_um_s if self.turn is None else self.turn.T @ wanted_um_s
 
 
-def learned_robot(p: Pipeline, last: Tick, refined: FlowField | None, flow: FlowField | None) -> LearnedRobot:
+def learned_robot(p: Swimming, last: Tick, refined: FlowField | None, flow: FlowField | None) -> LearnedRobot:
     """The robot as a refinement found it; `flow` is the map in use at this time."""
     refiner = p.refiner
     known = p.robot.learned_from(refined) if refiner.correct_robot else p.robot
@@ -81,14 +94,14 @@ def place_on_chip(estimate: Estimate, refined: FlowField | None) -> Estimate:
     return replace(estimate, position_um=on_chip(refined.registration, estimate.position_um))
 
 
-def _sphere(p: Pipeline, point_um: Floats) -> SphereBetweenWalls:
+def _sphere(p: Swimming, point_um: Floats) -> SphereBetweenWalls:
     """The robot as a sphere at a point (2,)."""
     point = np.clip(point_um / p.chip.um_per_px, 0.0, np.array(p.clearance_um.shape[::-1]) - 1.0)
     near_px = np.array([bilinear(p.clearance_um, *point.tolist()) / p.chip.um_per_px])
     return SphereBetweenWalls.of(p.robot.radius_um / p.chip.um_per_px, near_px, p.widths.at(point[None]))
 
 
-def _between_walls(known: Robot, p: Pipeline, sphere: SphereBetweenWalls, refined: FlowField) -> Robot:
+def _between_walls(known: Robot, p: Swimming, sphere: SphereBetweenWalls, refined: FlowField) -> Robot:
     """The known robot with the um per revolution that a refinement found for a sphere at this place."""
     found = p.robot.um_per_rev_at(float(sphere.drag[0]), refined)
     if found is None:
@@ -99,7 +112,7 @@ def _between_walls(known: Robot, p: Pipeline, sphere: SphereBetweenWalls, refine
 
 
 def _slip_um_s(
-    p: Pipeline, sphere: SphereBetweenWalls, point_um: Floats, refined: FlowField, flow: FlowField
+    p: Swimming, sphere: SphereBetweenWalls, point_um: Floats, refined: FlowField, flow: FlowField
 ) -> Floats | None:
     """Velocity (2,) by which the flow carries a sphere otherwise than the fluid; None: the refinement has found none.
 

@@ -23,7 +23,7 @@ from flowrec.verbs.ways_out import zero_on_ways
 
 if TYPE_CHECKING:
     from flowrec.measure import MotionFit
-    from flowrec.verbs.protocol import Day
+    from flowrec.verbs.protocol_day import Day
 
 _DRIVEN = 0.7  # share of the highest frequency that a run reaches, from which on it tells of step-out
 

@@ -15,7 +15,7 @@ from flowrec.store import GrowingRun
 
 if TYPE_CHECKING:
     from flowrec.stages import ResolvedConfig
-    from flowrec.verbs.protocol import Day
+    from flowrec.verbs.protocol_day import Day
 
 _BEGIN_S = 180.0  # until a run makes a field: the first one of an installation compiles
 _LONG_S = 60.0  # of a run that does not end by itself
