@@ -17,10 +17,8 @@ from flowrec.physics import ChannelWidths, Chip, Robot, SphereBetweenWalls, on_c
 from flowrec.stages.control.tracking_laws import limit_length
 from flowrec.stages.refine import Refiner
 
-# Radii from the centre to four points around it: the mean of the flow there is v + a^2 / 6 lap v, which carries the
-# sphere (Faxen 1922).
-_FAXEN_RADII = float(np.sqrt(2.0 / 3.0))
-_AROUND = _FAXEN_RADII * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+_STEP_RADII = float(np.sqrt(2.0 / 3.0))  # over which the flow is differentiated: within the sphere, and not into a wall
+_CROSS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
 class Swimming(Protocol):
@@ -122,5 +120,7 @@ def _slip_um_s(
     share = refined.parameter("sphere_share")
     if share is None or share[0] <= 0.0:
         return None
-    here, *around = sample(flow, point_um + p.robot.radius_um * np.vstack([np.zeros((1, 2)), _AROUND]))
-    return np.asarray(share[0] * (np.mean(around, axis=0) - (1.0 + sphere.lag[0]) * here))
+    step_px = _STEP_RADII * sphere.radius_px
+    v, *beside = sample(flow, point_um + step_px * p.chip.um_per_px * _CROSS)
+    laplacian = (np.sum(beside, axis=0) - 4.0 * v) / step_px**2
+    return np.asarray(share[0] * sphere.transport_slip(v[None], laplacian[None])[0])
