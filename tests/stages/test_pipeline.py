@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import Outcome, Phase
+from flowrec.core import Hand, Outcome, Phase
 from flowrec.physics import ROLLING_BY_DRAG, sample
 from flowrec.stages import Inputs, assemble, step
 
@@ -192,8 +192,8 @@ def test_beside_walls_observer_and_coils_know_that_the_flow_carries_a_sphere_mor
     wide = chip.um_per_px * float(pipeline.widths.at(at_um[None] / chip.um_per_px)[0])
     radius, far, flow = pipeline.robot.radius_um, wide - near, sample(field, at_um)
     held = 5.0 / 16.0 * (far - near) * ((radius / near) ** 3 / far - (radius / far) ** 3 / near)
-    step = 0.5 * radius * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    laplacian = (sample(field, at_um + step).sum(axis=0) - 4.0 * flow) / (0.5 * radius) ** 2
+    beside = 0.5 * radius * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    laplacian = (sample(field, at_um + beside).sum(axis=0) - 4.0 * flow) / (0.5 * radius) ** 2
     slip = radius**2 / 6.0 * laplacian - held * flow
     size = np.hypot(*slip)
     assert size > 0.03 * np.hypot(*flow) and slip @ flow < 0.0, "or there is nothing to see"
@@ -204,6 +204,14 @@ def test_beside_walls_observer_and_coils_know_that_the_flow_carries_a_sphere_mor
     assert np.hypot(*(lagging.demand.velocity_um_s - ordered - slip)) < 0.3 * size
     assert lagging.observations.same_as(plain.observations)
     assert flown(1.0, stated).estimate.same_as(plain.estimate)
+
+    now = ticks[30]
+    hand = Hand(now.stamp_ns, True, np.array([0.6, 0.0]), 0.01, "keys")
+    steered = [
+        step(pipeline, tick, Inputs(now.stamp_ns, now.frame, now.applied, hand=hand)) for tick in (plain, lagging)
+    ]
+    assert all(tick.mission.by_hand for tick in steered)
+    assert steered[1].currents.heading_rad == steered[0].currents.heading_rad == 0.0, "a hand is not corrected"
 
 
 def test_an_observer_that_corrects_the_map_reads_it_where_the_registration_puts_the_robot(navigation):

@@ -58,6 +58,13 @@ def test_the_prediction_over_windows_is_the_mean_over_their_fluid_also_where_the
     assert (operator.pixels[:, 0] == observation_operator(observations, mask, px, None).pixels[:, 0]).all()
 
 
+def test_observations_of_two_kinds_joined_state_neither_size(observed):
+    *_, one = observed
+    other = replace(one, radius_um=5.0, window_um=20.0)
+    assert (one.followed_by(other).radius_um, one.followed_by(other).window_um) == (None, None)
+    assert (other.followed_by(other).radius_um, other.followed_by(other).window_um) == (5.0, 20.0)
+
+
 def test_a_mean_over_less_than_a_pixel_is_the_value_at_the_place(observed):
     case, _, observations = observed
     small = replace(observations, window_um=0.6 * case.chip.um_per_px)
