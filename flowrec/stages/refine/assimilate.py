@@ -24,6 +24,7 @@ from flowrec.stages.refine.causes import AS_STATED, Observed
 from flowrec.stages.refine.discretisation_error import ModelError
 from flowrec.stages.refine.disturbances import held_back
 from flowrec.stages.refine.doubts import deposits_um_s
+from flowrec.stages.refine.faster_flow import at_observed_speed
 from flowrec.stages.refine.field_variance import expected_error, field_variance, prior_variance
 from flowrec.stages.refine.findings import explained_by_pump, findings, wanders, with_departure, with_obstacle
 from flowrec.stages.refine.flow_model import FlowModel, flow_model
@@ -146,9 +147,9 @@ class Assimilate(PriorSettings):
         FlowError
             If the flow of the fitted parameters can not be computed.
         """
-        operator = self.with_shaking(problem.operator.distinct(), problem.chip, problem.solver)
+        chip, operator = self.as_observed(problem.operator.distinct(), problem.chip, problem.solver)
         problem = replace(problem, operator=operator)
-        every = self.hypotheses(problem.operator, problem.chip, problem.solver)
+        every = self.hypotheses(operator, chip, problem.solver)
         if obstacles and problem.chip.law is None and _is_small(problem.chip):
             every = self._with_obstacles(every, problem)
         flow_um_s, std_um_s = of_the_field(every.best)
@@ -172,11 +173,13 @@ class Assimilate(PriorSettings):
             return None
         return expected_error(model.base, prior_variance(model))
 
-    def with_shaking(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> ObservationOperator:
-        """The observations with the shaking of the stage among their disturbances, where they show one."""
-        own = self._observe(chip, chip, operator, solver)
+    def as_observed(
+        self, operator: ObservationOperator, chip: Chip, solver: FlowSolver
+    ) -> tuple[Chip, ObservationOperator]:
+        """The chip, faster where the observations show it, and these with the shaking of the stage, if they show it."""
+        chip, own = at_observed_speed(chip, partial(self._observe, stated=chip, operator=operator, solver=solver))
         found = shaking_stage(own, robust_noise(own))
-        return operator if found is None else replace(operator, disturbances=(*operator.disturbances, found))
+        return chip, operator if found is None else replace(operator, disturbances=(*operator.disturbances, found))
 
     def hypotheses(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> Hypotheses:
         """The flows of the plausible hypotheses.

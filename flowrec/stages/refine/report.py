@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from flowrec.core import Floats
 from flowrec.physics import Chip
+from flowrec.stages.refine.faster_flow import FAST
 from flowrec.stages.refine.hypothesis import HypothesisFit
 from flowrec.stages.refine.noise import NOISE, NOISIER
 from flowrec.stages.refine.observation_operator import ObservationOperator
@@ -39,6 +40,10 @@ def report(chip: Chip, operator: ObservationOperator, best: HypothesisFit, cause
     if noisier > NOISIER:
         parts.append(f"they scatter {noisier:.1f} times more than their std says, error bars widened")
     mean, covariance = best.unknowns("boundary")
+    own, stated = best.observed.model, np.abs(chip.boundary_values).max()
+    times = np.abs(own.prior.chip(own.chip, best.posterior.mean).boundary_values).max() / stated
+    if times > FAST[0] and np.abs(own.chip.boundary_values).max() > stated:
+        parts.append(f"the flow is {times:.1f} times the assumed one: check the inlet speed and its unit")
     far = [
         f"{_name(chip, index)} ({abs(mean[index]):.0f} prior std {'higher' if mean[index] > 0.0 else 'lower'})"
         for index in range(len(chip.openings))

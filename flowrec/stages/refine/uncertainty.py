@@ -35,7 +35,7 @@ def flow_uncertainty(
             return FlowUncertainty(
                 model.base, columns, rolled, _block_diagonal(covariance, np.diag([GAIN[0] ** 2])), left
             )
-        operator = settings.with_shaking(operator, chip, solver)
+        chip, operator = settings.as_observed(operator, chip, solver)
         every = settings.hypotheses(operator, chip, solver)
     except FlowError:
         return None
