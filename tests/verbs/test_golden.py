@@ -28,7 +28,7 @@ from flowrec.verbs.session_replay import replay_session
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 MODERATE = GOLDEN.with_name("golden_moderate.mcap")
 SETTLED = GOLDEN.with_name("golden_numerics5.mcap")
-TRACED = GOLDEN.with_name("golden_numerics9.mcap")
+TRACED = GOLDEN.with_name("golden_numerics10.mcap")
 BY_OTHER_NUMERICS = {"/flow/assumed", "/flow/refined"}
 
 
