@@ -187,7 +187,8 @@ def _resistor_flows(chip: Chip) -> tuple[Floats, Floats, float]:
         laplacian = laplacian + link.T @ conduct @ link
         # Half of the flow through each link belongs to either of its pixels.
         links.append(0.5 * abs(link).T @ conduct @ link)
-    loads, grounded = np.zeros((len(chip.openings), count)), np.zeros(count)
+    # Fluid that no outlet reaches leaks a little, or its pressure would be any.
+    loads, grounded = np.zeros((len(chip.openings), count)), np.full(count, 1e-9 * conductance.max())
     for load, opening in zip(loads, chip.openings, strict=True):
         pixels = border(number, opening.side)[opening.first : opening.last + 1]
         pixels = pixels[pixels >= 0]

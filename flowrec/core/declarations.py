@@ -209,8 +209,13 @@ class Message:
     def refuse_not_finite(self) -> None:
         """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
         for name in _finite_fields(type(self)):
-            value = getattr(self, name)
-            if value is not None and not _is_finite(value):
+            value = getattr(self, name)  # looked at here: a function would be called for each of some hundred a tick
+            if isinstance(value, np.ndarray):
+                few = value.size <= _FEW
+                finite = all(map(math.isfinite, value.ravel().tolist())) if few else bool(np.isfinite(value).all())
+            else:
+                finite = value is None or math.isfinite(value)
+            if not finite:
                 raise NotFiniteError(_refusal(self))
 
     def since_s(self, earlier: Message | None) -> float:
@@ -235,14 +240,6 @@ class Message:
 def _finite_fields(message_type: type) -> tuple[str, ...]:
     """Names of the fields whose numbers may be NaN or infinite by their type only."""
     return tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
-
-
-def _is_finite(value: float | NDArray[np.floating]) -> bool:
-    if not isinstance(value, np.ndarray):
-        return math.isfinite(value)
-    if value.size <= _FEW:
-        return all(map(math.isfinite, value.ravel().tolist()))
-    return bool(np.isfinite(value).all())
 
 
 def _refusal(message: Message) -> str:
