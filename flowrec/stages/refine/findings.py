@@ -17,6 +17,7 @@ from flowrec.stages.refine.predictive_check import NATS, UNEXPLAINED, Departure
 
 SURE = 2.5  # standard deviations from zero above which a cause is named
 PROBABLE = 0.9  # probability of a depth, or of none, above which it is said
+LIKELY = 0.75  # of walls that are all off, from which on it is said: odds of 3 ("positive", Kass and Raftery 1995)
 # Factor for people, least value that is worth a word, and the words for a negative and a positive value. Clockwise is
 # from +x to +y, as the chip is drawn. The values have the signs of causes.py: um_per_px_share is the stated scale over
 # the true one, less 1; an offset is where the robot is, from where it was measured, so the chip lies the other way.
@@ -142,7 +143,7 @@ def _bias_words(found: Sequence[HypothesisFit], weights: Floats) -> list[str]:
     """That all walls are off by the same distance, where that is likely."""
     biased = [index for index, one in enumerate(found) if one.observed.wall_mode is not None]
     share = float(weights[biased].sum())
-    if share < 0.5:
+    if share < LIKELY:
         return []
     mean, covariance = found[biased[0]].unknowns(WALL_BIAS_NAME)
     px = found[biased[0]].observed.um_per_px

@@ -12,6 +12,8 @@ from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
 from flowrec.physics.flow.wall_offset import with_levels, with_wall_offset
 from flowrec.stages.refine import Assimilate, Refiner
+from flowrec.stages.refine.findings import findings
+from flowrec.stages.refine.observation_operator import observation_operator
 from flowrec.stages.refine.wall_bias import OFFSETS_PX, nearest_offset, wall_mode
 
 WIDTH_PX, SPEED_UM_S = 12, 100.0
@@ -82,6 +84,13 @@ def test_a_threshold_that_is_off_by_a_fraction_of_a_pixel_is_found_with_the_flow
     off = (refined.velocity_um_s - true.velocity_um_s)[chip.mask]
     assert np.sqrt((off**2).sum() / (true.velocity_um_s[chip.mask] ** 2).sum()) < 0.02
     assert (np.abs(off) < 2.0 * refined.std_um_s[chip.mask]).mean() > 0.9
+    # It is said where the odds are three or more.
+    seen = observation_operator(Observations(0, places, flow, std), chip.mask, chip.um_per_px, refined.wall_px)
+    off_alike = Assimilate().hypotheses(seen, chip, solver).best
+    as_drawn = replace(off_alike, observed=replace(off_alike.observed, wall_mode=None))
+    for share in (0.6, 0.7, 0.8, 0.95):
+        words = findings([off_alike, as_drawn], np.array([share, 1.0 - share])).words
+        assert any("mask" in word for word in words) == (share > 0.75)
     # Of walls that are as drawn nothing is said.
     drawn = solver.solve(chip)
     flow = sample(drawn, places) + 2.0 * np.random.default_rng(2).standard_normal(places.shape)
