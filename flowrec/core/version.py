@@ -4,7 +4,7 @@ A session without a version of the numerics is of version 1, the first release.
 """
 
 __version__ = "0.1.0"
-# 10: that the inlets are a power of two times as fast as stated is a hypothesis of the refinement.
+# 10: that the inflow is a power of two times the stated one, or reversed, is a hypothesis of the refinement.
 # 9: a stretch of a tracer's way counts only if nearly all images show the tracer; ways may be of one stretch.
 # 8: tracers count by the length of way that they went, whatever their number; 2000 stretches are of the whole run.
 # 7: a refined flow states the um per revolution as a line over the drag of the side walls.

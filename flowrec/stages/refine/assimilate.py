@@ -24,7 +24,6 @@ from flowrec.stages.refine.causes import AS_STATED, Observed
 from flowrec.stages.refine.discretisation_error import ModelError
 from flowrec.stages.refine.disturbances import held_back
 from flowrec.stages.refine.doubts import deposits_um_s
-from flowrec.stages.refine.faster_flow import at_observed_speed
 from flowrec.stages.refine.field_variance import expected_error, field_variance, prior_variance
 from flowrec.stages.refine.findings import explained_by_pump, findings, wanders, with_departure, with_obstacle
 from flowrec.stages.refine.flow_model import FlowModel, flow_model
@@ -40,6 +39,7 @@ from flowrec.stages.refine.hypothesis import (
     shaking_stage,
 )
 from flowrec.stages.refine.method import RefinementProblem
+from flowrec.stages.refine.misstated_inflow import at_observed_inflow
 from flowrec.stages.refine.noise import Robust, outlying, robust_noise
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.obstacles import PLACES, Obstacle, likely_obstacles, with_shape_error
@@ -176,8 +176,8 @@ class Assimilate(PriorSettings):
     def as_observed(
         self, operator: ObservationOperator, chip: Chip, solver: FlowSolver
     ) -> tuple[Chip, ObservationOperator]:
-        """The chip, faster where the observations show it, and these with the shaking of the stage, if they show it."""
-        chip, own = at_observed_speed(chip, partial(self._observe, stated=chip, operator=operator, solver=solver))
+        """The chip with another inflow, and the observations with a shaking of the stage, where these show one."""
+        chip, own = at_observed_inflow(chip, partial(self._observe, stated=chip, operator=operator, solver=solver))
         found = shaking_stage(own, robust_noise(own))
         return chip, operator if found is None else replace(operator, disturbances=(*operator.disturbances, found))
 

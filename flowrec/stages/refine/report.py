@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from flowrec.core import Floats
 from flowrec.physics import Chip
-from flowrec.stages.refine.faster_flow import FAST
 from flowrec.stages.refine.hypothesis import HypothesisFit
+from flowrec.stages.refine.misstated_inflow import FAR
 from flowrec.stages.refine.noise import NOISE, NOISIER
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.prior import Prior
@@ -18,7 +18,7 @@ from flowrec.stages.refine.prior import Prior
 UNOBSERVED = 0.9  # posterior over prior std above which an opening counts as not observed
 WEAK = 0.6  # ratio above which it is tested whether openings are observed together
 OBSERVED_TOGETHER = 0.4  # ratio of their sum below which they are
-FAR = 3.0  # prior standard deviations from the assumed value
+UNLIKELY = 3.0  # prior standard deviations from the assumed value
 OUTLIER = 0.5  # inlier probability below which an observation counts as an outlier
 LEAST_GAIN = 1.0  # in ln evidence over the assumed flow
 
@@ -40,20 +40,33 @@ def report(chip: Chip, operator: ObservationOperator, best: HypothesisFit, cause
     if noisier > NOISIER:
         parts.append(f"they scatter {noisier:.1f} times more than their std says, error bars widened")
     mean, covariance = best.unknowns("boundary")
-    own, stated = best.observed.model, np.abs(chip.boundary_values).max()
-    times = np.abs(own.prior.chip(own.chip, best.posterior.mean).boundary_values).max() / stated
-    if times > FAST[0] and np.abs(own.chip.boundary_values).max() > stated:
+    times = _times(chip, best)
+    if times > 1.0 + FAR:
         parts.append(f"the flow is {times:.1f} times the assumed one: check the inlet speed and its unit")
+    elif times < 0.0:
+        parts.append(
+            f"the flow is {-times:.1f} times the assumed one in the other direction: exchange inlet and outlet"
+        )
     far = [
         f"{_name(chip, index)} ({abs(mean[index]):.0f} prior std {'higher' if mean[index] > 0.0 else 'lower'})"
         for index in range(len(chip.openings))
-        if abs(mean[index]) > FAR
+        if abs(mean[index]) > UNLIKELY
     ]
     if far:
         parts.append(f"far from what was assumed: {', '.join(far)}")
     if moved < 1.0 and best.gain() < LEAST_GAIN:
         parts.append("they do not ask for another flow than the assumed one")
     return "; ".join([*parts, *_unobserved_openings(chip, covariance, best.observed.model.prior)])
+
+
+def _times(chip: Chip, best: HypothesisFit) -> float:
+    """The boundary values that were found over those of a chip, where all are off by one factor; else 1."""
+    own = best.observed.model
+    largest = int(np.abs(chip.boundary_values).argmax())
+    if own.chip.boundary_values[largest] == chip.boundary_values[largest]:
+        return 1.0
+    fitted = own.prior.chip(own.chip, best.posterior.mean).boundary_values
+    return float(fitted[largest] / chip.boundary_values[largest])
 
 
 def over_error(change: NDArray[np.floating], std: NDArray[np.floating]) -> float:

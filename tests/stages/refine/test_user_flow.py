@@ -178,7 +178,7 @@ def test_masks_and_chips_that_carry_no_flow_are_refused_in_one_line(mask: Any) -
         assert "\n" not in str(caught.value) and isinstance(caught.value, FlowrecError)
 
 
-@pytest.mark.parametrize("factor", [-20.0, 1000.0, -1000.0])
+@pytest.mark.parametrize("factor", [1000.0, -1000.0])
 def test_speeds_far_above_all_that_the_method_can_follow_are_refused_with_the_unit_and_the_speed_to_give(
     mask: Any, measured: Any, factor: float
 ) -> None:
@@ -191,8 +191,10 @@ def test_speeds_far_above_all_that_the_method_can_follow_are_refused_with_the_un
     assert refined.velocity_um_s[16, 30, 0] == pytest.approx(1.5 * 150.0 * factor, rel=0.05)
 
 
-@pytest.mark.parametrize(("seed", "factor"), [(0, 8.0), (0, 12.0), (2, 13.0), (1, 45.0), (3, 96.0)])
-def test_a_flow_that_is_many_times_as_fast_as_assumed_is_found_and_told_in_the_note(seed: int, factor: float) -> None:
+@pytest.mark.parametrize(("seed", "factor"), [(0, 8.0), (0, -12.0), (2, 13.0), (1, -45.0), (3, 96.0)])
+def test_a_flow_many_times_as_fast_as_assumed_either_way_is_found_and_told_in_the_note(
+    seed: int, factor: float
+) -> None:
     mask = np.zeros((40, 160), np.bool_)
     mask[10:30] = True
     options: Any = {"um_per_px": 5.0, "inlet_speed_um_s": 100.0}
@@ -203,8 +205,9 @@ def test_a_flow_that_is_many_times_as_fast_as_assumed_is_found_and_told_in_the_n
     assert refined.error_share is not None
     truth = replace(assumed, velocity_um_s=np.float32(factor) * assumed.velocity_um_s)
     assert error_of(refined, truth) < 2.0 * refined.error_share < 0.1
-    told = re.search(r"the flow is ([0-9.]+) times the assumed one", refined.note)
-    assert told is not None and float(told[1]) == pytest.approx(factor, rel=0.05)
+    told = re.search(r"the flow is ([0-9.]+) times the assumed one(.*?):", refined.note)
+    assert told is not None and float(told[1]) == pytest.approx(abs(factor), rel=0.05)
+    assert told[2] == ("" if factor > 0.0 else " in the other direction")
 
 
 def test_speeds_of_another_unit_sign_or_direction_that_the_method_follows_are_told_in_the_note(

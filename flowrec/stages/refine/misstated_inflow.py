@@ -1,0 +1,51 @@
+"""An inflow that is stated far from what it is: a pump set in another unit, a default left, inlet and outlet exchanged.
+
+The prior of an inlet's speed is a Gaussian a quarter of it wide (prior.py). Under it observations of a flow ten times
+as fast are outliers, and what is left of them is explained by whatever else is free. That all boundary values are off
+by a power of two, in this or the other direction, is a hypothesis of its own, of small probability; between two powers
+the Gaussian reaches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from flowrec.physics import Chip
+from flowrec.stages.refine.causes import Observed
+from flowrec.stages.refine.hypothesis import first_evidence
+from flowrec.stages.refine.noise import outlying, robust_noise
+
+FAR = 1.0  # of the ratio to the stated inflow, from 1: four standard deviations of an inlet's speed
+OTHER_UNIT = 100.0  # ratio from which on it is not the pump that is wrong, but the unit of the observations
+SHARE = 5e-4  # prior probability of that: one observation, which may be wrong, gains up to 7.1 nats, two gain 14
+_SLOW = 0.1  # of the fastest predicted flow: slower places say little of the ratio
+
+
+def at_observed_inflow(chip: Chip, observe: Callable[[Chip], Observed]) -> tuple[Chip, Observed]:
+    """The chip with other boundary values, all by one factor, where the observations ask for it; else as it is.
+
+    With them the observations in its flow, as `observe` gives them.
+    """
+    stated = observe(chip)
+    ratio = _ratio(stated)
+    if abs(ratio - 1.0) < FAR or abs(ratio) > OTHER_UNIT:
+        return chip, stated
+    other = chip.with_boundary(np.copysign(2.0 ** np.round(np.log2(abs(ratio))), ratio) * chip.boundary_values)
+    observed = observe(other)
+    return (other, observed) if _evidence(observed) - _evidence(stated) > -np.log(SHARE) else (chip, stated)
+
+
+def _ratio(observed: Observed) -> float:
+    """Median ratio of what was observed to the assumed flow, along that; 1 where nothing flows."""
+    predicted = observed.operator.predict(observed.model.base)
+    square = (predicted**2).sum(axis=1)
+    moves = square > _SLOW**2 * square.max()
+    along = (observed.operator.flow_um_s * predicted).sum(axis=1)
+    return float(np.median(along[moves] / square[moves])) if moves.any() else 1.0
+
+
+def _evidence(observed: Observed) -> float:
+    robust = robust_noise(observed)
+    return first_evidence(observed, robust) - outlying(robust)
