@@ -17,7 +17,7 @@ from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.hypothesis import first_evidence
 from flowrec.stages.refine.noise import outlying, robust_noise
 
-FAR = 1.0  # of the ratio to the stated inflow, from 1: four standard deviations of an inlet's speed
+REACHED = (-0.25, 2.0)  # ratios to the stated inflow that the Gaussian reaches: five standard deviations down, four up
 OTHER_UNIT = 100.0  # ratio from which on it is not the pump that is wrong, but the unit of the observations
 SHARE = 5e-4  # prior probability of that: one observation, which may be wrong, gains up to 7.1 nats, two gain 14
 _SLOW = 0.1  # of the fastest predicted flow: slower places say little of the ratio
@@ -30,7 +30,7 @@ def at_observed_inflow(chip: Chip, observe: Callable[[Chip], Observed]) -> tuple
     """
     stated = observe(chip)
     ratio = _ratio(stated)
-    if abs(ratio - 1.0) < FAR or abs(ratio) > OTHER_UNIT:
+    if REACHED[0] < ratio < REACHED[1] or abs(ratio) > OTHER_UNIT:
         return chip, stated
     other = chip.with_boundary(np.copysign(2.0 ** np.round(np.log2(abs(ratio))), ratio) * chip.boundary_values)
     observed = observe(other)

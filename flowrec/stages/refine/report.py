@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flowrec.core import Floats
 from flowrec.physics import Chip
 from flowrec.stages.refine.hypothesis import HypothesisFit
-from flowrec.stages.refine.misstated_inflow import FAR
+from flowrec.stages.refine.misstated_inflow import REACHED
 from flowrec.stages.refine.noise import NOISE, NOISIER
 from flowrec.stages.refine.observation_operator import ObservationOperator
 from flowrec.stages.refine.prior import Prior
@@ -41,7 +41,7 @@ def report(chip: Chip, operator: ObservationOperator, best: HypothesisFit, cause
         parts.append(f"they scatter {noisier:.1f} times more than their std says, error bars widened")
     mean, covariance = best.unknowns("boundary")
     times = _times(chip, best)
-    if times > 1.0 + FAR:
+    if times > REACHED[1]:
         parts.append(f"the flow is {times:.1f} times the assumed one: check the inlet speed and its unit")
     elif times < 0.0:
         parts.append(
