@@ -65,6 +65,16 @@ def test_a_goal_that_no_plan_leads_to_gives_way_to_the_former_one(known: bool) -
     assert (end.phase, end.outcome) == (("navigate", "") if known else ("done", "unreachable"))
 
 
+def test_of_several_goals_that_no_plan_leads_to_the_mission_goes_back_to_the_one_before_all_of_them() -> None:
+    world = World(phases=("navigate",))
+    world.tick()
+    world.tick(goal=AWAY)
+    world.tick(goal=FARTHER)
+    ordered = world.tick(assumed=field(1))
+    assert goal_of(ordered) == FARTHER
+    assert goal_of(world.tick(route=route(ordered.request, reachable=False))) == GOAL
+
+
 def test_on_the_way_the_robot_goes_on_until_a_route_leads_to_the_new_goal() -> None:
     world = navigating()
     asked = world.tick(goal=AWAY, progress=1.0)
@@ -200,6 +210,16 @@ def test_a_lower_speed_limit_plans_anew_and_so_does_taking_it_away() -> None:
     assert (fast.phase, fast.planned_um_s, fast.speed_limit_um_s) == ("plan", ROBOT.speed_limit_um_s, None)
     assert world.tick(route=answer(4, GOAL)).phase == "navigate"
     assert world.tick(operator="speed", limit_um_s=590.0).phase == "navigate"  # nothing that matters
+
+
+def test_a_robot_that_becomes_faster_by_itself_keeps_its_way_whatever_a_person_has_set_before() -> None:
+    world = navigating()
+    world.tick(operator="speed", limit_um_s=590.0)
+    world.robot = ROBOT.limited_to(0.5 * 24.0)  # it steps out
+    assert world.tick().wanted == "route"
+    assert world.tick(route=answer(3, GOAL)).phase == "navigate"
+    world.robot = ROBOT
+    assert (world.tick().phase, world.tick().wanted) == ("navigate", "")
 
 
 def test_a_limit_during_an_order_counts_when_it_is_answered() -> None:
