@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import Estimate, Route
+from flowrec.core import Demand, Estimate, Route
 from flowrec.stages import CONTROLLERS, Controller
-from flowrec.stages.control.delay_compensation import corrected_flow
-from flowrec.stages.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback
-from flowrec.stages.control.trajectory import feasible_pace, nearest_time
+from flowrec.stages.control.delay_compensation import CorrectedFlow, corrected_flow
+from flowrec.stages.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback, Situation
+from flowrec.stages.control.trajectory import feasible_pace, follow, nearest_time
 from tests.stages.control.plant import ROBOT, field_of, fly, mission, straight
 
 STILL = field_of(lambda x, y: (0.0 * x, 0.0 * y))
@@ -148,6 +148,20 @@ def test_a_route_that_begins_far_away_waits_for_the_robot_at_its_beginning():
     on_the_way = [demand for demand in run.demands if demand.error_um > 200.0]
     assert max(demand.progress_s for demand in on_the_way) < 0.01
     assert run.demands[-1].progress_s > 5.0 and run.demands[-1].error_um < 10.0
+
+
+@pytest.mark.parametrize("behind_um", [0.0, 60.0, 90.0, 120.0, 300.0])
+def test_where_the_reference_will_be_and_how_fast_it_goes_agree_whatever_its_pace(behind_um):
+    route, delay_s = straight(speed_um_s=200.0), 0.2
+    robot, place = replace(ROBOT, delay_s=delay_s), np.array([1500.0 - behind_um, 2500.0])
+    before = Demand(1, np.zeros(2), place, 5.0, 0.0, False, np.zeros((0, 2)))
+    still = CorrectedFlow(None, np.zeros(2))
+    now = Situation(before, mission(), route, seen_at(place, 33_000_001), None, still, robot, place, 600.0, 0.033, 50.0)
+    reference = follow(now, route, 25.0, 150.0, 0.95)
+    paces = np.clip((150.0 - behind_um) / 125.0, 0.0, 1.0)
+    np.testing.assert_allclose(reference.velocity_um_s, [200.0 * paces, 0.0], atol=1e-6)
+    np.testing.assert_allclose(reference.position_um, [1500.0 + 0.033 * 200.0 * paces, 2500.0])
+    np.testing.assert_allclose(reference.future_um - reference.position_um, delay_s * reference.velocity_um_s, atol=1e-6)
 
 
 def test_the_place_on_a_route_nearest_to_a_robot_is_that_of_the_projection():
