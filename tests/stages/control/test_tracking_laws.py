@@ -161,7 +161,9 @@ def test_where_the_reference_will_be_and_how_fast_it_goes_agree_whatever_its_pac
     paces = np.clip((150.0 - behind_um) / 125.0, 0.0, 1.0)
     np.testing.assert_allclose(reference.velocity_um_s, [200.0 * paces, 0.0], atol=1e-6)
     np.testing.assert_allclose(reference.position_um, [1500.0 + 0.033 * 200.0 * paces, 2500.0])
-    np.testing.assert_allclose(reference.future_um - reference.position_um, delay_s * reference.velocity_um_s, atol=1e-6)
+    np.testing.assert_allclose(
+        reference.future_um - reference.position_um, delay_s * reference.velocity_um_s, atol=1e-6
+    )
 
 
 def test_the_place_on_a_route_nearest_to_a_robot_is_that_of_the_projection():
@@ -177,3 +179,18 @@ def test_an_observer_that_knows_the_map_is_not_thought_to_lag_behind_it():
     np.testing.assert_allclose(corrected_flow(corner, corrected, sent, 0.3, 0.0).at(place), [20.0, 330.0], atol=1.0)
     doubted = corrected_flow(corner, corrected, sent, 0.3, 0.3).at(place)
     assert np.hypot(*(doubted - [0.0, 300.0])) < 10.0, "as one that lags it is hardly believed just behind a corner"
+
+
+def test_the_demand_makes_up_for_the_flow_that_an_observer_finds_on_the_map_and_hardly_for_that_of_one_that_lags():
+    corner = field_of(lambda x, y: (300.0 * (x < 2500.0), 300.0 * (x >= 2500.0)))
+    place, sent = np.array([2575.0, 2525.0]), np.array([[400.0, -300.0]])
+    before = Demand(1, sent[0], place, 0.0, 0.0, False, sent)
+    estimate = Estimate(33_000_001, place, np.array([20.0, 330.0]), np.diag([1.0, 1.0, 4.0, 4.0]), 2.0, place, True)
+
+    def made_up_for(knows_map):
+        law = Controller(map_error=0.3, kp_per_s=0.0, observer_lag_s=0.3 * ROBOT.speed_ratio)
+        at_rest = law.control(before, mission(), None, estimate, corner, ROBOT, None, 50.0, estimate_uses_map=knows_map)
+        return -at_rest.velocity_um_s
+
+    assert np.hypot(*(made_up_for(True) - [20.0, 330.0])) < 2.0
+    assert np.hypot(*(made_up_for(False) - [0.0, 300.0])) < 10.0
