@@ -212,6 +212,24 @@ def test_hindrance_and_lag_are_those_of_a_sphere_where_its_radius_is_stated(twin
     assert case.error(refined) < 0.04
 
 
+@pytest.mark.parametrize("radius_um", [None, 20.0])
+def test_tracers_beside_a_wall_do_not_change_what_the_walls_do_to_the_robot(twin, radius_um):
+    case, settings = twin(), SETTINGS.assimilate
+    model = flow_model(settings, settings.model, case.chip, case.solver)
+    robot = replace(flown(case), radius_um=radius_um)
+    beside_um = np.column_stack([np.linspace(30.0, 180.0, 9), np.full(9, 208.0)])
+    beads = Observations(0, beside_um, np.ones((9, 2)), np.ones(9), None, np.arange(9.0), tracer=np.arange(9.0))
+
+    def seen(made):
+        return Observed.of(model, observation_operator(made, case.chip.mask, 10.0, case.assumed.wall_px))
+
+    alone, both = seen(robot), seen(robot.with_tracers(beads))
+    count = alone.operator.count
+    assert both.operator.count == count + 9
+    np.testing.assert_allclose(both.near[:count], alone.near)
+    assert both.least_px == alone.least_px
+
+
 def test_what_a_robot_rolls_is_found_as_a_line_over_the_drag_of_the_side_walls(twin):
     case, radius_px = twin(), 3.0
     observed = replace(flown(case, count=120), radius_um=radius_px * case.chip.um_per_px)
