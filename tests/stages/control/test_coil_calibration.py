@@ -59,6 +59,29 @@ def test_standard_errors_are_those_of_many_calibrations():
     assert np.mean([bool(f.suspects) for f in fits]) < 0.08, "false alarms"
 
 
+@pytest.mark.parametrize("bias", [BIAS, np.array([0.3, -0.5, 3.0])])
+def test_the_error_that_is_said_of_4_mt_is_the_largest_of_any_direction_with_the_currents_against_the_bias(bias):
+    table = measured(2)
+    fit = fit_coils(table._replace(field_mt=table.field_mt + bias - BIAS))
+    directions = np.random.default_rng(0).standard_normal((20_000, 3))
+    fields = 4.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    design, currents = (np.column_stack([each, np.ones(len(each))]) for each in (CURRENTS, np.zeros((len(fields), 3))))
+    currents[:, :3] = np.linalg.solve(fit.mt_per_a, (fields - fit.bias_mt).T).T
+    leverage = ((currents @ np.linalg.pinv(design)) ** 2).sum(axis=1)
+    largest = np.sqrt(leverage.max() * (fit.noise_mt**2).sum())
+    assert 0.97 * largest < fit.uncertainty_mt < 1.001 * largest
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_coil_that_was_driven_one_way_only_is_named_whichever_way_that_is(sign):
+    currents = CURRENTS.copy()
+    currents[:, 1] = sign * np.abs(currents[:, 1])
+    told = [sentence for sentence in advice(fit_coils(measured(1, currents))) if "one way only" in sentence]
+    assert len(told) == 1 and told[0].startswith("coil y was driven")
+    currents[:, 1] += 0.1 * sign  # and never switched off
+    assert any("coil y was driven" in sentence for sentence in advice(fit_coils(measured(1, currents))))
+
+
 def test_leave_one_out_is_what_leaving_one_out_gives():
     table = measured(3)
     fit = fit_coils(table)
