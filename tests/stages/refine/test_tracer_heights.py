@@ -80,7 +80,8 @@ def test_what_the_robot_observed_is_left_as_it_is_and_some_of_the_tracers_are_us
     beads = of_beads(200, 1, each=10)
     own = beads.only(slice(0, 7))
     robot = replace(own, rolled_um_s=own.flow_um_s, radius_um=50.0, tracer=None, entered=None)
-    joined = robot.with_tracers(beads)
+    joined = robot.with_tracers(replace(beads, stamp_ns=robot.stamp_ns + 5))
+    assert joined.stamp_ns == robot.stamp_ns, "by it the next observation of the robot is due"
     assert joined.radius_um == 50.0 and not joined.rolled_um_s[7:].any() and (joined.tracer[:7] == -1.0).all()
     found = at_mean_height(joined, ASSUMED, DUCT)
     assert found.only(slice(0, 7)).flow_um_s.tolist() == robot.flow_um_s.tolist()
