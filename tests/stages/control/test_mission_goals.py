@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowrec.core import Mission, Route
+from flowrec.core import Mission, OperatorEvent, Route
+from flowrec.physics import Chip
+from flowrec.stages.pipeline import _goal_fault
 from tests.stages.control.test_mission import GOAL, ROBOT, World, field, route
 
 AWAY = (800.0, 500.0)
@@ -107,6 +110,22 @@ def test_a_goal_in_a_wall_is_refused_at_once_and_nothing_is_ordered(phase: str) 
     after = world.tick(goal=AWAY, fault="it is in a wall")
     assert (goal_of(after), after.note) == (GOAL, "goal there refused: it is in a wall")
     assert (after.request, after.former_goal_um.size, after.goal_set_ns) == (before.request, 0, None)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("at_px", "inside"), [(-0.4, True), (-0.6, False)])
+@pytest.mark.parametrize("far", [False, True])
+def test_a_goal_may_lie_up_to_the_edges_of_the_outermost_pixels(
+    axis: int, at_px: float, inside: bool, far: bool
+) -> None:
+    chip = Chip("field", np.ones((30, 50), bool), 20.0, (), 1.0, 1000.0)
+    place_um = np.array([300.0, 300.0])
+    place_um[axis] = 20.0 * ((49.0, 29.0)[axis] - at_px if far else at_px)
+    event = OperatorEvent(7, "goal", "there", place_um)
+    scene = SimpleNamespace(chip=chip, clearance_um=np.full((30, 50), 100.0, np.float32))
+    fault = _goal_fault(scene, SimpleNamespace(operator=event, stamp_ns=7))  # type: ignore[arg-type]
+    assert fault == ("" if inside else "it is outside the chip")
+    assert _goal_fault(scene, SimpleNamespace(operator=event, stamp_ns=8)) == "", "of an earlier tick"  # type: ignore[arg-type]
 
 
 def test_the_latest_of_several_goals_wins_and_an_answer_to_an_earlier_one_is_never_taken_for_it() -> None:
