@@ -192,6 +192,15 @@ def test_a_sphere_between_walls_follows_published_limits():
     assert middle.transport_slip(v, laplacian)[0] == pytest.approx([-90.0 * 0.25 / 3.0, 0.0])
 
 
+def test_a_sphere_that_is_seen_nearer_to_a_wall_than_its_radius_touches_it_and_never_the_one_behind_it():
+    width = np.full(5, 12.0)
+    seen = SphereBetweenWalls.of(4.0, np.array([-1.0, 0.5, 3.0, 3.9, 4.0]), width)
+    touching = SphereBetweenWalls.of(4.0, np.full(5, 4.0), width)
+    np.testing.assert_array_equal([seen.drag, seen.lag], [touching.drag, touching.lag])
+    narrow = SphereBetweenWalls.of(4.0, np.array([2.0]), np.array([5.0]))
+    assert narrow.far_px == narrow.near_px == 4.0 and narrow.lag == 0.0
+
+
 def test_the_width_of_a_channel_is_that_at_the_place_up_to_its_corners():
     mask = np.zeros((60, 80), bool)
     mask[5:11] = mask[20:50] = True  # channels of 6 and 30 pixels
