@@ -18,7 +18,7 @@ from flowrec.core import Appearance, Frame, Track
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages import Tracker, calibration_of, load_config
 from flowrec.stages.vision.assignment import ExpectedMotion, assign_objects, hidden_neighbours, with_motion
-from flowrec.stages.vision.learned import Candidates
+from flowrec.stages.vision.learned import VIEWS, Candidates, ForegroundRegion, ReducedScale, updated_look
 from flowrec.store import SessionReader
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.record import record
@@ -361,3 +361,20 @@ def test_the_velocity_of_a_robot_follows_its_places_slowly_and_one_wrong_place_h
     # 2 px along its velocity in 40 ms, and 10 px across by mistake.
     assert went.velocity_px_s.tolist() == pytest.approx([50.0, 0.3 * 250.0])
     assert went.energy == pytest.approx(40.0)
+
+
+def test_of_ever_new_looks_of_a_robot_the_first_and_the_newest_are_kept_and_never_more_than_eight() -> None:
+    rng, scale = np.random.default_rng(0), ReducedScale(6.0)
+    size = len(scale.window())
+    pictures = rng.normal(0.0, 10.0, (20, 40, 40)).astype(np.float32)
+    look = Appearance(0, "mixed", 1.0, 0.0, 6.0, np.array([20.0, 20.0]), pictures[0, :size, :size][None])
+    seen = []
+    for n, picture in enumerate(pictures):
+        region = ForegroundRegion(picture, 0.0, 0.0, scale)
+        look = updated_look(region, np.array([20.0, 20.0]), look, 0.3, True, n * 10**9)
+        half = size // 2
+        seen.append(picture[20 - half : 21 + half, 20 - half : 21 + half])
+    assert len(look.views) == VIEWS
+    np.testing.assert_array_equal(look.views[0], pictures[0, :size, :size])
+    np.testing.assert_allclose(look.views[1], seen[-1])
+    assert all(any(np.allclose(view, each) for each in seen) for view in look.views[2:])
