@@ -259,8 +259,9 @@ def test_walls_that_are_moved_twice_lie_where_one_move_puts_them_and_each_place_
     mask[5:11] = True
     openings = Opening("left", 5, 10, "inlet", 100.0), Opening("right", 5, 10, "outlet", 0.0)
     drawn = Chip("channel", mask, 10.0, openings, 1.0, 1000.0)
-    at_once, twice = with_wall_offset(drawn, 1.0), with_wall_offset(with_wall_offset(drawn, 0.4), 0.6)
-    assert np.array_equal(at_once.mask, twice.mask) and at_once.openings == twice.openings
+    at_once, twice = with_wall_offset(drawn, 0.7), with_wall_offset(with_wall_offset(drawn, 0.3), 0.4)
+    assert at_once.mask.sum() > mask.sum() and np.array_equal(at_once.mask, twice.mask)
+    assert at_once.openings == twice.openings and at_once.wall_offset_px == pytest.approx(twice.wall_offset_px)
     # Between pixel centres the mask and its openings are the same, and the walls are not.
     peaks = [
         FlowSolver().solve(with_wall_offset(drawn, offset_px)).velocity_um_s.max() for offset_px in (0.0, 0.1, 0.2, 0.1)
