@@ -10,7 +10,7 @@ from flowrec.measure import windings_matrix
 from flowrec.measure.calibrate_coils import calibrate_coils, settings_of
 from flowrec.measure.coil_calibration import Excitations, advice, fit_coils, read_excitations
 from flowrec.measure.coil_windings import winding_of
-from flowrec.measure.proposal import as_sets
+from flowrec.measure.proposal import as_sets, check_outputs, write_outputs
 from flowrec.stages import load_config
 from tests.conftest import invoke
 
@@ -308,3 +308,18 @@ def test_windings_that_are_none_are_refused_in_one_line(texts, says):
 def test_calibrate_coils_takes_a_table_or_windings_and_not_both(words):
     told = invoke("calibrate", "coils", *words).exception
     assert isinstance(told, UsageError) and "--winding" in str(told)
+
+
+def test_where_one_of_the_files_of_a_calibration_can_not_be_made_none_is_there(tmp_path):
+    def contents():
+        yield b"settings"
+        raise ValueError("no picture")
+
+    with pytest.raises(ValueError, match="no picture"):
+        write_outputs(check_outputs(tmp_path / "out.toml", (), False, (".png",)), contents())
+    assert not list(tmp_path.iterdir())
+    write_outputs(check_outputs(tmp_path / "out.toml", (), False, (".png",)), (b"settings", b"picture"))
+    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == {
+        "out.toml": b"settings",
+        "out.png": b"picture",
+    }
