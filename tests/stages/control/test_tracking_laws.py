@@ -8,7 +8,12 @@ import pytest
 from flowrec.core import Demand, Estimate, Route
 from flowrec.stages import CONTROLLERS, Controller
 from flowrec.stages.control.delay_compensation import CorrectedFlow, corrected_flow
-from flowrec.stages.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback, Situation
+from flowrec.stages.control.tracking_laws import (
+    FeedforwardFeedback,
+    LiteralFeedforwardFeedback,
+    Situation,
+    compensate_flow,
+)
 from flowrec.stages.control.trajectory import feasible_pace, follow, nearest_time
 from tests.stages.control.plant import ROBOT, field_of, fly, mission, straight
 
@@ -194,3 +199,20 @@ def test_the_demand_makes_up_for_the_flow_that_an_observer_finds_on_the_map_and_
 
     assert np.hypot(*(made_up_for(True) - [20.0, 330.0])) < 2.0
     assert np.hypot(*(made_up_for(False) - [0.0, 300.0])) < 10.0
+
+
+def test_of_all_demands_within_the_limit_that_keep_the_course_the_one_nearest_to_its_speed_is_taken():
+    rng, factors = np.random.default_rng(4), np.linspace(-16.0, 16.0, 64_001)
+    slow = rng.uniform(60.0, 300.0, 150)[:, None] * np.exp(1j * rng.uniform(0.0, 2.0 * np.pi, 150)).view(float).reshape(
+        -1, 2
+    )
+    for wanted, flow in zip(slow, rng.uniform(-400.0, 400.0, (150, 2)), strict=True):
+        demand, limited = compensate_flow(wanted, flow, 300.0)
+        speeds = np.hypot(*(factors[:, None] * wanted - flow).T)
+        able = factors[speeds <= 300.0]
+        assert limited == (np.hypot(*(wanted - flow)) > 300.0)
+        if len(able):
+            best = able[np.argmin(np.abs(able - 1.0))] * wanted - flow
+            np.testing.assert_allclose(demand, best if limited else wanted - flow, atol=0.2)
+        else:  # swept off its course, it opposes the flow as well as it can
+            assert np.hypot(*demand) == pytest.approx(300.0)

@@ -409,3 +409,19 @@ def test_the_own_motion_of_an_estimate_is_that_of_the_um_per_revolution_that_it_
     after = observer.estimate(known, track(1, 1.3 * ROBOT.um_per_rev * turned), driven, ROBOT)
     assert after.um_per_rev == pytest.approx(1.3 * ROBOT.um_per_rev, rel=0.05)
     np.testing.assert_allclose(after.rolled_um_s, after.um_per_rev * turned / after.since_s(known))
+
+
+def test_the_error_of_an_observation_grows_with_the_own_motion_alone_and_an_unlikely_position_makes_none() -> None:
+    covariance = np.diag([4.0, 4.0, 9.0, 9.0])  # without memory
+
+    def seen(index: int, place: list[float], flow: list[float], nis: float = 2.0) -> Estimate:
+        position = np.array(place)
+        return Estimate(round(index * 1e9 / RATE_HZ), position, np.array(flow), covariance, nis, position, True)
+
+    sampler = Sampler(rolling_share=0.05, floor_um_s=0.001)
+    for over_ground, own in (([100.0, 0.0], 0.0), ([100.0, 240.0], 240.0), ([0.0, 0.0], 100.0)):
+        places = np.array([[0.0, 0.0], np.array(over_ground) / RATE_HZ])
+        before, now = (seen(n, place.tolist(), [100.0, 0.0]) for n, place in enumerate(places))
+        found = sampler.collect(None, before, now, ROBOT)
+        assert found is not None and found.std_um_s.tolist() == pytest.approx([math.hypot(3.0, 0.05 * own)])
+        assert sampler.collect(None, before, replace(now, nis=25.1), ROBOT) is None
