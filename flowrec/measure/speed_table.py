@@ -117,9 +117,8 @@ def _speeds(
 
 
 def _rising(knots_hz: Floats, speeds: Floats, std: Floats) -> SpeedTable:
-    """The pairs up to the fastest speed, each faster than the one before."""
-    last = int(np.argmax(speeds))
-    kept = [n for n in range(last + 1) if speeds[n] > max(speeds[:n], default=0.0)]
+    """The pairs that are faster than all before them, so none beyond the fastest speed."""
+    kept = [n for n, speed in enumerate(speeds) if speed > max(speeds[:n], default=0.0)]
     if len(kept) < 2:
         return SpeedTable((), (), "the speed does not rise with the frequency; does the robot step out at all of them")
     pairs = tuple((float(f"{knots_hz[n]:.4g}"), float(f"{speeds[n]:.4g}")) for n in kept)

@@ -16,6 +16,7 @@ from flowrec.core import (
     Demand,
     Estimate,
     Extra,
+    Mission,
     Observations,
     PumpShare,
     RobotWalls,
@@ -44,6 +45,7 @@ from flowrec.stages.control.events import event_of
 from flowrec.stages.estimation import Sampler
 from flowrec.stages.other_robots import OtherRobots, as_stated, expected_robots, observe_others
 from flowrec.stages.robot_topics import messages_of, robot_topics
+from flowrec.stages.run_figures import RobotStatistics, RunStatistics
 from tests.short_missions import SMALL
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=28.0)
@@ -102,6 +104,27 @@ def test_the_speed_is_limited_only_while_a_robot_is_near_a_wall_and_driven_there
     assert walls(y_um, velocity).limit_um_s is None, "no limit unless one is set"
     told = walls(y_um, velocity, OtherRobots(speed_limit_um_s=70.0))
     assert told.limit_um_s == (70.0 if limited else None)
+
+
+def test_one_robot_near_a_wall_and_another_that_is_driven_to_a_wall_far_off_limit_nothing() -> None:
+    demand = Demand(0, np.array([0.0, 100.0]), np.full(2, math.nan), 0.0, 0.0, False, np.zeros((0, 2)))
+    settings, near_ceiling_um = OtherRobots(speed_limit_um_s=50.0), 190.0 + 60.0
+    places = (near_ceiling_um, 560.0 - 100.0)  # the first one is driven off its wall, the second one towards its own
+    tracks, estimates = [track(y_um) for y_um in places], [estimate(y_um) for y_um in places]
+    told = settings.watch(Tick(demand=demand), tracks, estimates, ROBOT, [50.0, 50.0], CLEARANCE, UM)
+    assert told.near.tolist() == [1.0, 0.0] and told.towards_um_s[0] < 0.0 < told.towards_um_s[1]
+    assert told.limit_um_s is None
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_robot_is_expected_as_nearly_as_its_estimate_tells_after_a_time(seen) -> None:
+    dt, covariance = 0.5, np.kron(np.array([[900.0, 700.0], [700.0, 1600.0]]), np.eye(2))
+    told = replace(estimate(MIDDLE_UM), covariance=covariance)
+    last = Tick(track=track(MIDDLE_UM, seen=seen), estimate=told)
+    still = Applied(0, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+    (expected,) = expected_robots(last, 1, still, round(dt * 1e9), ROBOT)
+    variance = dt**2 * 1600.0 + (0.0 if seen else 900.0 + 2.0 * dt * 700.0)  # where it was seen it is known better
+    assert expected.std_um == pytest.approx(math.hypot(math.sqrt(variance), 0.12 * ROBOT.radius_um))
 
 
 def test_of_a_robot_that_is_not_in_view_nothing_is_told() -> None:
@@ -298,3 +321,24 @@ def test_an_observation_is_less_certain_while_the_own_motion_of_a_robot_of_unkno
     assert stds[0.0] == pytest.approx(math.hypot(7.0, 2.8), rel=0.05), "uneven rolling, and the sampler's own"
     late_um_s = ROBOT.delay_s * 10.0 / 0.04
     assert stds[10.0] == pytest.approx(math.hypot(stds[0.0], late_um_s), rel=0.05)
+
+
+def test_the_least_distance_of_a_robot_is_that_of_the_frames_that_show_it_near_a_wall() -> None:
+    figures = RobotStatistics(1)
+    for number, wall_um in enumerate((80.0, math.nan, 30.0, math.nan, 55.0)):
+        told = RobotWalls(number, np.array([wall_um]), np.array([float(wall_um < 40.0)]), np.zeros(1))
+        figures.write(Tick(number, extra=Extra({WALLS: told})), track(MIDDLE_UM, stamp_ns=number))
+    assert figures.text == "tracked in 100% of 5 images, at least 30 um from walls, 1 alarm near walls"
+
+
+def test_the_tracking_error_counts_each_demand_once_and_only_on_the_way_to_the_goal() -> None:
+    run, nothing = RunStatistics(), np.zeros(2)
+    demands = [
+        Demand(n, nothing, nothing, 0.0, error, False, np.zeros((0, 2))) for n, error in enumerate((9.0, 3.0, 4.0))
+    ]
+    way = [("plan", demands[0]), ("navigate", demands[1]), *3 * [("navigate", demands[2])]]
+    for stamp_ns, (phase, demand) in enumerate(way):
+        mission = Mission(0, phase, 0, 1, "", 0, nothing, nothing, False, "", "")
+        run.write(Tick(stamp_ns, mission=mission, demand=demand))
+    assert run.tracking_error_um == pytest.approx(math.sqrt((9.0 + 16.0) / 2.0))
+    assert run.navigating_ns == 1

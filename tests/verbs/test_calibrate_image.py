@@ -16,9 +16,10 @@ import pytest
 import flowrec
 from flowrec.core import UsageError
 from flowrec.measure import registration_state
-from flowrec.measure.calibrate_image import fragment
+from flowrec.measure.calibrate_image import fragment, settings_of
 from flowrec.physics import Calibration
 from flowrec.stages import CameraSettings, load_config, with_sets
+from flowrec.stages.config import registration_of
 from flowrec.verbs.record import record
 from tests.conftest import invoke
 from tests.short_missions import SMALL, set_words
@@ -103,6 +104,20 @@ def test_the_standard_errors_of_a_registration_are_in_the_units_that_stand_besid
     text = fragment(done, fit)
     assert "# Standard errors: 0.7 um, 0.05 degrees, 0.25 %.\n" in text
     assert "90 % of the walls in the picture agree, 80 % of the chip's walls" in text
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("angle_deg", [0.0, 37.0, 200.0, -90.0])
+@pytest.mark.parametrize("size_px", [(80, 64), (81, 65)])
+def test_the_settings_of_a_pose_put_each_pixel_where_the_pose_has_it(size_px, angle_deg, mirror):
+    pose = Calibration(10.2, (512.3, 431.7), angle_deg, mirror=mirror)
+    fit: Any = SimpleNamespace(calibration=pose, residual_um=2.0)
+    picture = SimpleNamespace(image=np.zeros(size_px[::-1], np.uint8), source="a.png", sha256="0" * 64)
+    sets = settings_of(SimpleNamespace(picture=picture, registered_on="2026-01-10"), fit)  # type: ignore[arg-type]
+    camera = SimpleNamespace(size_px=(sets["width_px"], sets["height_px"]), **sets)
+    again = registration_of(camera, SimpleNamespace(size_um=(1000.0, 800.0), um_per_px=20.0))  # type: ignore[arg-type]
+    places_px = np.array([[0.0, 0.0], [79.0, 0.0], [0.0, 63.0], [31.5, 20.25]])
+    np.testing.assert_allclose(again.to_um(places_px), pose.to_um(places_px), atol=0.01)
 
 
 @pytest.mark.slow("searches a picture twice, for every angle and mirrored")

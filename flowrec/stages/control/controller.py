@@ -297,9 +297,8 @@ def _hold_position(now: Situation) -> Floats:
         return previous.reference_um
     if not now.estimate.seen and not previous.velocity_um_s.any():
         return np.full(2, np.nan)
-    since_ns, hold_ns = mission.since_ns, _hold_ns(mission)
-    if hold_ns is not None and mission.phase in _FOLLOWING:
-        since_ns = max(since_ns, hold_ns)
+    hold_ns = _hold_ns(mission)  # a mission that is held stays in its phase
+    since_ns = hold_ns if hold_ns is not None and mission.phase in _FOLLOWING else mission.since_ns
     return now.predicted_um if since_ns > previous.stamp_ns else previous.reference_um
 
 

@@ -36,8 +36,8 @@ def ground_speed(
 ) -> Floats:
     """Speed over ground (n,) in um/s of a robot at points (n, 2) that moves along directions (n, 2) of any length.
 
-    d . v + sqrt(V^2 - |v_perp|^2); -inf where the flow across is faster than V. With `idle_um_s` the robot saves
-    energy: sqrt(idle^2 + |v|^2), limited to what V allows (kernels.step_energy).
+    d . v + sqrt(V^2 - |v_perp|^2); -inf where the flow across is faster than V, and V for a direction without length.
+    With `idle_um_s` the robot saves energy: sqrt(idle^2 + |v|^2), limited to what V allows (kernels.step_energy).
     """
     velocity = sample(field, points_um)
     along, spare = along_and_spare(velocity, directions, speed_um_s)
@@ -88,7 +88,6 @@ def travel_time(
     distance = (lengths / steps)[leg]
     possible = ground > 1e-9 * speed_um_s
     time = np.where(possible, distance / np.where(possible, ground, 1.0), np.inf)
-    time[distance == 0.0] = 0.0  # a leg without length takes no time in any flow
     arrival[1:] = np.cumsum(np.add.reduceat(time, first))
     return arrival, bool(np.isfinite(arrival[-1]))
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from flowrec.core import DeviceClock, envelope
+from flowrec.core import DeviceClock, envelope, nanoseconds, seconds
 
 
 @settings(max_examples=60)
@@ -72,3 +72,23 @@ def test_the_window_of_a_fit_is_a_minute_whatever_the_camera_counts(unit_ns):
     before, after = fits[440], fits[-1]
     assert before.rate / unit_ns == pytest.approx(1.0, abs=1e-5)
     assert after.rate / unit_ns == pytest.approx(1.0 / (1.0 + 2e-4), abs=1e-5)
+
+
+@pytest.mark.parametrize("set_back_ns", [400_000_000, 2**32])
+def test_a_counter_that_is_set_back_is_followed_from_its_third_frame_on_at_the_latest(set_back_ns):
+    # A counter of 64 bits, of which that of 32 bits would only have begun again.
+    frame_ns = 33_333_333
+    arrival = 10**9 + frame_ns * np.arange(240)
+    device = 10**13 + arrival - np.where(np.arange(240) < 200, 0, set_back_ns)
+    fits = stamps_of(DeviceClock(), device, arrival)
+    skipped = [n for n, fit in enumerate(fits) if not fit.good]
+    assert skipped == ([200, 201] if set_back_ns < 10**9 else [])
+    assert [n for n, fit in enumerate(fits) if fit.flag == "reset"] == [200 + len(skipped)]
+    assert not any(fit.flag == "wrapped" for fit in fits)
+    assert abs(fits[-1].stamp_ns - arrival[-1]) < 2_000_000
+
+
+@given(st.floats(-1e5, 1e5))
+def test_a_stamp_is_the_nearest_to_its_time(time_s):
+    assert abs(nanoseconds(time_s) - time_s * 1e9) <= 0.51
+    assert seconds(nanoseconds(time_s)) == pytest.approx(time_s, rel=0.0, abs=0.6e-9)

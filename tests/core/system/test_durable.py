@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import resource
 import shutil
 import signal
@@ -24,6 +25,7 @@ from flowrec.core import (
     temporary_name,
 )
 from flowrec.core.system.leftovers import OLD
+from flowrec.core.system.outputs import is_as_written, note_written, written_sha256
 from flowrec.store import notes_file
 from flowrec.store.notes import append_note, read_notes
 from tests.conftest import invoke, until
@@ -116,6 +118,39 @@ def test_what_was_put_in_the_place_of_an_output_while_it_was_made_stays(tmp_path
     with pytest.raises(SessionError, match=r"a\.json"), output.new_file():
         path.write_bytes(b"of a person")
     assert path.read_bytes() == b"of a person" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_name_is_free_again_where_a_file_can_not_get_it_on_a_disk_without_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "no links here")
+
+    monkeypatch.setattr("os.link", refused)
+    with replacing(tmp_path / "a.json", overwrite=False) as part:
+        part.write_bytes(b"whole")
+    assert (tmp_path / "a.json").read_bytes() == b"whole"
+    monkeypatch.setattr(Path, "replace", refused)
+    with pytest.raises(PermissionError), replacing(tmp_path / "b.json", overwrite=False) as part:
+        part.write_bytes(b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_an_output_is_replaced_only_where_it_is_the_file_that_was_written_and_from_the_same_facts(
+    tmp_path: Path,
+) -> None:
+    path, facts = tmp_path / "a.json", {"session": "abc", "format": "json"}
+    assert written_sha256(path, facts) == ""
+    path.write_bytes(b"ours")
+    note_written(path, facts)
+    sha256 = written_sha256(path, facts)
+    assert sha256 and is_as_written(path, facts)
+    assert written_sha256(path, facts | {"session": "def"}) == "" and not is_as_written(path, facts | {"new": "1"})
+    Output(path, JSON, replaces=sha256).check()
+    path.rename(tmp_path / "elsewhere.json")
+    path.symlink_to(tmp_path / "elsewhere.json")  # of a person, for whom the file behind it may be another one soon
+    with pytest.raises(SessionError, match=r"a\.json"):
+        Output(path, JSON, replaces=sha256).check()
 
 
 def test_what_a_killed_process_has_left_is_removed_and_nothing_that_may_be_in_use(tmp_path: Path) -> None:

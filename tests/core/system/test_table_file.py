@@ -1,6 +1,7 @@
 """Tables as people save them: separators, byte orders, Excel; and what is no number is named with its line."""
 
 import re
+import time
 import zipfile
 from datetime import UTC, datetime
 
@@ -74,6 +75,17 @@ def test_dates_are_times_and_a_number_is_never_taken_for_one(kind, tmp_path):
         read_table(tmp_path / "log.csv").times_s()
 
 
+@pytest.mark.skipif(not hasattr(time, "tzset"), reason="the zone of a process can not be set")
+def test_dates_without_a_zone_are_those_of_utc_wherever_the_computer_is(tmp_path, monkeypatch):
+    (tmp_path / "log.csv").write_text("time\n2026-05-03T14:00:00\n2026-05-03T14:00:01\n")
+    with monkeypatch.context() as there:
+        there.setenv("TZ", "XYZ-5:30")
+        time.tzset()
+        times_s = read_table(tmp_path / "log.csv").times_s()[1]
+    time.tzset()
+    assert times_s.tolist() == [datetime(2026, 5, 3, 14, 0, second, tzinfo=UTC).timestamp() for second in (0, 1)]
+
+
 def test_a_first_sheet_without_a_table_is_named(tmp_path):
     book = openpyxl.Workbook()
     book.active.append(["notes"])
@@ -92,6 +104,7 @@ def test_a_first_sheet_without_a_table_is_named(tmp_path):
         ("t,f\n0,1\n\n1,\n", "line 4: f is empty"),
         ("t,f\n0,1\n12:03:05,1\n", r"line 3: t = '12:03:05' is no number"),
         ("t,f\n0,1\n1\n", "line 3: 1 values where the header has 2"),
+        ("t,f\n0,1\n1,2,3\n", "line 3: 3 values where the header has 2"),
         ("t,f,f\n0,1,2\n", "two columns are named f"),
         ("t,g\n0,1\n", "no column f; its columns are t, g"),
         ("", "is empty"),

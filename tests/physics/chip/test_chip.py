@@ -324,3 +324,14 @@ def test_the_distance_to_an_opening_is_that_to_the_border_of_the_image():
     # Beside an opening: to its nearest place.
     corner = replace(left, last=1)
     assert distance_um(chip, corner, (0.0, 100.0)) == pytest.approx(np.hypot(10.0, 80.0))
+
+
+@pytest.mark.parametrize("um_per_px", [5.0, 20.0])
+def test_the_point_of_an_opening_lies_so_many_um_along_the_channel_in_its_middle(um_per_px):
+    mask = np.zeros((15, 200), bool)
+    mask[4:11] = True
+    openings = Opening("left", 4, 10, "inlet", 100.0), Opening("right", 4, 10, "outlet", 0.0)
+    chip = Chip("straight", mask, um_per_px, openings, 1.0, 1000.0)
+    for name, end_px, sign in (("inlet", 0.0, 1.0), ("outlet", 199.0, -1.0)):
+        x_um, y_um = opening_point_um(chip, name, 300.0)
+        assert (x_um, y_um) == pytest.approx((end_px * um_per_px + sign * 300.0, 7.0 * um_per_px))

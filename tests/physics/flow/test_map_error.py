@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.physics import Robot
+from flowrec.physics import FlowUncertainty, Robot
 from flowrec.physics.flow import map_error
 from flowrec.physics.flow.map_error import MapError
 from flowrec.stages import Controller, Kalman, Planner, SurveyPlanner
@@ -41,3 +41,14 @@ def test_a_map_that_states_a_small_error_needs_less_room_in_a_fast_flow() -> Non
     off_um = [swift.course_error(ROBOT, 0.0, replace(field, error_share=share)).um(field) for share in (0.05, 0.1)]
     straight_um = swift.course_error(ROBOT, 0.0, field).um(field) - 0.07 * 0.2 * 400.0
     assert np.allclose([off_um[0] - straight_um, off_um[1] - straight_um], [[[2.8]], [[5.6]]], atol=1e-6)
+
+
+def test_the_standard_deviation_of_a_flow_is_that_of_draws_from_its_modes_and_of_what_no_mode_explains():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(4, 4))
+    columns, mean, left = rng.normal(size=(3, 5, 2)), 10.0 + rng.normal(size=(5, 2)), rng.uniform(0.5, 2.0, 5)
+    flow = FlowUncertainty(mean, columns, np.ones((1, 5)), root @ root.T, left)
+    z = (rng.normal(size=(40_000, 4)) @ root.T)[:, :3]  # the last unknown is of the robot
+    drawn = np.tensordot(z, columns, axes=1) + left[:, None] * rng.normal(size=(40_000, 5, 2))
+    np.testing.assert_allclose(flow.std_um_s, drawn.std(axis=0), rtol=0.03)
+    assert flow.error_share == pytest.approx(np.sqrt((drawn**2).sum(axis=(1, 2)).mean() / (mean**2).sum()), rel=0.03)

@@ -252,3 +252,18 @@ def test_walls_at_grey_levels_lie_between_the_pixels_and_move_outwards_from_ther
         # The flow rate is the same in wider walls: 12 mu Q / w^3.
         expected = -12e-3 * SPEED * 1e-6 * width_px * 20.0 / (width**3 * UM_PER_PX * 1e-6)
         assert drop == pytest.approx(expected, rel=0.02)
+
+
+def test_walls_that_are_moved_twice_lie_where_one_move_puts_them_and_each_place_has_a_flow_of_its_own():
+    mask = np.zeros((16, 40), bool)
+    mask[5:11] = True
+    openings = Opening("left", 5, 10, "inlet", 100.0), Opening("right", 5, 10, "outlet", 0.0)
+    drawn = Chip("channel", mask, 10.0, openings, 1.0, 1000.0)
+    at_once, twice = with_wall_offset(drawn, 0.7), with_wall_offset(with_wall_offset(drawn, 0.3), 0.4)
+    assert at_once.mask.sum() > mask.sum() and np.array_equal(at_once.mask, twice.mask)
+    assert at_once.openings == twice.openings and at_once.wall_offset_px == pytest.approx(twice.wall_offset_px)
+    # Between pixel centres the mask and its openings are the same, and the walls are not.
+    peaks = [
+        FlowSolver().solve(with_wall_offset(drawn, offset_px)).velocity_um_s.max() for offset_px in (0.0, 0.1, 0.2, 0.1)
+    ]
+    assert peaks[0] > peaks[1] > peaks[2] and peaks[1] == peaks[3]

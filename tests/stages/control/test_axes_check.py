@@ -165,3 +165,20 @@ def test_the_gain_of_a_recording_is_found_although_the_commands_compensate_a_flo
     np.testing.assert_allclose(gain, turned, atol=max(4.0 * float(std.max()), 0.1))
     assert orientation_by_motion(gain, std).orientation == ORIENTATIONS[6]
     assert orientation_by_motion(*own_gain(time_s[:20], seen_um[:20], own_um[:20])).verdict == "undecided"
+
+
+@pytest.mark.parametrize("jumps", [0, 4])
+def test_the_stated_errors_of_a_gain_are_those_of_many_recordings_also_where_the_track_jumps(jumps):
+    rng, time_s = np.random.default_rng(5), np.arange(0.0, 16.0, 1 / 30)
+    errors, stds = [], []
+    for _ in range(40):
+        ways = rng.normal(0.0, 150.0, (40, 2))[np.minimum((time_s / 0.4).astype(int), 39)]
+        own_um = np.cumsum(ways / 30, axis=0)
+        seen_um = own_um + np.cumsum(rng.normal(0.0, 3.0, own_um.shape), axis=0)
+        seen_um[rng.choice(len(time_s), jumps, replace=False)] += 3000.0
+        gain, std = own_gain(time_s, seen_um, own_um)
+        errors.append(gain - np.eye(2))
+        stds.append(std)
+    scatter, stated = np.sqrt(np.mean(np.square(errors), axis=0)), np.sqrt(np.mean(np.square(stds), axis=0))
+    np.testing.assert_allclose(np.log(stated / scatter), 0.0, atol=0.5)
+    assert scatter.max() < 0.2

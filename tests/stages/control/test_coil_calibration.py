@@ -10,7 +10,7 @@ from flowrec.measure import windings_matrix
 from flowrec.measure.calibrate_coils import calibrate_coils, settings_of
 from flowrec.measure.coil_calibration import Excitations, advice, fit_coils, read_excitations
 from flowrec.measure.coil_windings import winding_of
-from flowrec.measure.proposal import as_sets
+from flowrec.measure.proposal import as_sets, check_outputs, write_outputs
 from flowrec.stages import load_config
 from tests.conftest import invoke
 
@@ -57,6 +57,29 @@ def test_standard_errors_are_those_of_many_calibrations():
     known = np.sqrt(np.mean([f.uncertainty_mt**2 for f in fits]))
     assert 0.7 * known < np.sqrt(np.mean(np.sum(np.square(missed), 1))) <= 1.05 * known, "said is the worst direction"
     assert np.mean([bool(f.suspects) for f in fits]) < 0.08, "false alarms"
+
+
+@pytest.mark.parametrize("bias", [BIAS, np.array([0.3, -0.5, 3.0])])
+def test_the_error_that_is_said_of_4_mt_is_the_largest_of_any_direction_with_the_currents_against_the_bias(bias):
+    table = measured(2)
+    fit = fit_coils(table._replace(field_mt=table.field_mt + bias - BIAS))
+    directions = np.random.default_rng(0).standard_normal((20_000, 3))
+    fields = 4.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    design, currents = (np.column_stack([each, np.ones(len(each))]) for each in (CURRENTS, np.zeros((len(fields), 3))))
+    currents[:, :3] = np.linalg.solve(fit.mt_per_a, (fields - fit.bias_mt).T).T
+    leverage = ((currents @ np.linalg.pinv(design)) ** 2).sum(axis=1)
+    largest = np.sqrt(leverage.max() * (fit.noise_mt**2).sum())
+    assert 0.97 * largest < fit.uncertainty_mt < 1.001 * largest
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_coil_that_was_driven_one_way_only_is_named_whichever_way_that_is(sign):
+    currents = CURRENTS.copy()
+    currents[:, 1] = sign * np.abs(currents[:, 1])
+    told = [sentence for sentence in advice(fit_coils(measured(1, currents))) if "one way only" in sentence]
+    assert len(told) == 1 and told[0].startswith("coil y was driven")
+    currents[:, 1] += 0.1 * sign  # and never switched off
+    assert any("coil y was driven" in sentence for sentence in advice(fit_coils(measured(1, currents))))
 
 
 def test_leave_one_out_is_what_leaving_one_out_gives():
@@ -285,3 +308,18 @@ def test_windings_that_are_none_are_refused_in_one_line(texts, says):
 def test_calibrate_coils_takes_a_table_or_windings_and_not_both(words):
     told = invoke("calibrate", "coils", *words).exception
     assert isinstance(told, UsageError) and "--winding" in str(told)
+
+
+def test_where_one_of_the_files_of_a_calibration_can_not_be_made_none_is_there(tmp_path):
+    def contents():
+        yield b"settings"
+        raise ValueError("no picture")
+
+    with pytest.raises(ValueError, match="no picture"):
+        write_outputs(check_outputs(tmp_path / "out.toml", (), False, (".png",)), contents())
+    assert not list(tmp_path.iterdir())
+    write_outputs(check_outputs(tmp_path / "out.toml", (), False, (".png",)), (b"settings", b"picture"))
+    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == {
+        "out.toml": b"settings",
+        "out.png": b"picture",
+    }

@@ -119,3 +119,17 @@ def test_the_exported_coils_of_a_session_are_a_log_of_them(tmp_path):
     assert log.times_ns.tolist() == [each.stamp_ns for each in applied]
     turns = [log.turns(before.stamp_ns, now.stamp_ns) for before, now in itertools.pairwise(applied)]
     np.testing.assert_allclose(turns, [each.turns for each in applied[1:]], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_turns_that_a_log_states_are_all_in_it_also_where_the_field_was_switched_on_or_off_between(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    turns, amplitude = rng.normal(0.0, 0.5, (30, 2)), rng.choice([0.0, 4.0], 30)
+    turns[1:][np.maximum(amplitude[1:], amplitude[:-1]) == 0.0] = 0.0  # without a field it does not turn
+    times_s = np.cumsum(rng.uniform(0.02, 0.1, 30))
+    rows = np.column_stack([times_s, turns, amplitude])
+    path = write(tmp_path / "turns.csv", ["time_s", "turns_x", "turns_y", "amplitude_mt"], rows)
+    log = read_coil_log(path, Columns(), Coils())
+    for n in range(29):
+        begin, end = (round(each * 1e9) for each in times_s[n : n + 2])
+        np.testing.assert_allclose(log.turns(begin, end), turns[n + 1], atol=1e-9)

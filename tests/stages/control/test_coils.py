@@ -288,6 +288,10 @@ def test_a_plan_is_made_for_the_speed_that_the_coils_leave_the_robot():
     share = 1.5 * 1.5 / 4.0  # of the full field, by the z coil
     assert resolved.robot.max_speed_um_s == pytest.approx(600.0 * 1.2 * 0.9 * share, abs=0.1)
     assert resolve(resolved, load_chip(config.chip)).robot == resolved.robot
+    slow = load_config(None, [sets[0], "robot.max_speed_um_s=100", "robot.step_out_hz=30"])
+    assert resolve(slow, load_chip(slow.chip)).robot.max_speed_um_s == 100.0, (
+        "the coils leave it more than it is to have"
+    )
 
 
 @pytest.mark.parametrize(("kind", "ramp_s"), [("current", 0.0), ("current", 0.2), ("voltage", 0.2)])

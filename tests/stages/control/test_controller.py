@@ -291,3 +291,11 @@ def test_an_observer_is_believed_by_what_the_map_states_of_itself(stated_um_s, l
     seen = Estimate(0, CENTRE_UM, np.array([60.0, 300.0]), covariance, 2.0, CENTRE_UM, True)
     correction = corrected_flow(mapped, seen, np.zeros((0, 2)), 0.3, 0.0).at(CENTRE_UM)[0]
     assert least * 60.0 < correction < most * 60.0
+
+
+@pytest.mark.parametrize("found_um_s", [4.0, 50.0, 1000.0])
+def test_the_correction_of_a_map_is_never_more_than_twice_what_the_map_may_be_wrong_by(found_um_s):
+    mapped = field_of(lambda x, y: (0.0 * x, 300.0 + 0.0 * x))
+    sure = Estimate(0, CENTRE_UM, np.array([found_um_s, 300.0]), 1e-6 * np.eye(4), 2.0, CENTRE_UM, True)
+    correction = corrected_flow(mapped, sure, np.zeros((0, 2)), 0.05, 0.0).correction_um_s
+    np.testing.assert_allclose(correction, [min(found_um_s, 2.0 * (0.05 * 300.0 + 1.0)), 0.0], rtol=1e-3)

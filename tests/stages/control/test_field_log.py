@@ -89,6 +89,20 @@ def test_on_another_clock_the_turns_between_the_same_instants_are_scaled_by_its_
     np.testing.assert_allclose(moved.turns(160 * MS, 520 * MS), 1.2 * log.turns(100 * MS, 400 * MS), rtol=1e-9)
 
 
+@settings(max_examples=40, deadline=None)
+@given(ROWS)
+def test_between_samples_the_field_turns_as_their_mean_also_where_it_is_switched_on_or_off(rows):
+    rows = [(gap + 8, *values) for gap, *values in rows]
+    log, times = log_of(rows)
+    even = log.interpolate()
+    rates = [f * (b > 0.0) * np.array([np.cos(heading), np.sin(heading)]) for _, f, heading, b in rows]
+    for n in range(len(rows) - 1):
+        lasts_s = (times[n + 1] - times[n]) * 1e-9
+        expected = 0.5 * lasts_s * (rates[n] + rates[n + 1])
+        np.testing.assert_allclose(even.turns(int(times[n]), int(times[n + 1])), expected, atol=1e-6)
+        assert even.at(int(times[n + 1])).amplitude_mt <= 4.0
+
+
 def test_a_stamp_that_goes_back_is_refused():
     log = FieldLog([5, 9], [1.0, 1.0], [0.0, 0.0], [4.0, 4.0])
     with pytest.raises(ValueError, match="last row"):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from flowrec.core import Applied, Demand, Estimate, FlowField, Mission, Observations, OperatorEvent, Route, Track
 from flowrec.physics import Robot
@@ -37,6 +39,14 @@ def surveying(**settings) -> World:  # type: ignore[no-untyped-def]
     world.tick()
     world.tick(assumed=field(1))
     assert world.tick(route=stretch(2, 1000.0)).phase == "survey"
+    return world
+
+
+def waiting_for_the_field(**settings) -> World:  # type: ignore[no-untyped-def]
+    """A robot that is held at its start by other means, with the flow solved."""
+    world = World(phases=("navigate",), **settings)
+    world.tick()
+    world.tick(assumed=field(1))
     return world
 
 
@@ -154,6 +164,7 @@ def test_a_robot_never_seen_is_not_found_and_one_lost_for_long_is_lost() -> None
     world.tick()
     world.tick(route=route(1))
     assert world.tick(seen=False, lost=10).outcome == ""
+    assert world.tick(seen=False, lost=90).outcome == "", "so many frames, and no more, are allowed"
     assert world.tick(seen=False, lost=91).outcome == "lost"
 
 
@@ -257,6 +268,41 @@ def test_the_time_of_every_hold_is_taken_off_the_limits_and_not_that_of_the_last
     assert world.mission is not None and world.mission.held_ns == 23 * 10**9
     outcomes = [world.tick().outcome for _ in range(15)]
     assert outcomes.index("timeout") == 11  # of 2 x 4 s and 5 s two had passed
+
+
+HERE = {"at": (200.0, 500.0), "progress": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("begin", "where"),
+    [
+        (lambda: surveying(survey_limit_s=9.0), HERE),
+        (lambda: surveying(stuck_s=2.0), HERE | {"error_um": 200.0}),
+        (lambda: navigating(patience=2.0, reassimilate_observations=0), HERE),
+        (lambda: navigating(stuck_s=2.0, reassimilate_observations=0), HERE | {"error_um": 140.0}),
+        (lambda: navigating(wait_at_goal_s=7.0), {"at": GOAL, "progress": 4.0}),
+        (lambda: waiting_for_the_field(hold_start_s=8.0), {}),
+    ],
+    ids=["survey", "stuck survey", "way", "stuck on the way", "wait at the goal", "let go"],
+)
+def test_a_hold_delays_whatever_time_would_bring_by_as_long_as_it_lasts(
+    begin: Callable[[], World], where: dict[str, object]
+) -> None:
+    def seconds_to_the_next_order(hold_s: int) -> int:
+        world = begin()
+        world.tick(**where)
+        if hold_s:
+            world.tick(**where, operator="pause")
+            for _ in range(hold_s - 1):
+                world.tick(**where)
+        before = world.tick(**where, operator="resume")
+        for passed_s in range(50):
+            now = world.tick(**where)
+            if (now.phase, now.wanted, now.outcome) != (before.phase, before.wanted, before.outcome):
+                return passed_s
+        raise AssertionError("time brings nothing")
+
+    assert {seconds_to_the_next_order(hold_s) for hold_s in (0, 2, 30)} == {seconds_to_the_next_order(1)}
 
 
 def test_a_held_robot_that_is_carried_off_is_swept_until_it_is_back() -> None:

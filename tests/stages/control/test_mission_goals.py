@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowrec.core import Mission, Route
+from flowrec.core import Mission, OperatorEvent, Route
+from flowrec.physics import Chip
+from flowrec.stages.pipeline import _goal_fault
 from tests.stages.control.test_mission import GOAL, ROBOT, World, field, route
 
 AWAY = (800.0, 500.0)
@@ -65,6 +68,16 @@ def test_a_goal_that_no_plan_leads_to_gives_way_to_the_former_one(known: bool) -
     assert (end.phase, end.outcome) == (("navigate", "") if known else ("done", "unreachable"))
 
 
+def test_of_several_goals_that_no_plan_leads_to_the_mission_goes_back_to_the_one_before_all_of_them() -> None:
+    world = World(phases=("navigate",))
+    world.tick()
+    world.tick(goal=AWAY)
+    world.tick(goal=FARTHER)
+    ordered = world.tick(assumed=field(1))
+    assert goal_of(ordered) == FARTHER
+    assert goal_of(world.tick(route=route(ordered.request, reachable=False))) == GOAL
+
+
 def test_on_the_way_the_robot_goes_on_until_a_route_leads_to_the_new_goal() -> None:
     world = navigating()
     asked = world.tick(goal=AWAY, progress=1.0)
@@ -97,6 +110,22 @@ def test_a_goal_in_a_wall_is_refused_at_once_and_nothing_is_ordered(phase: str) 
     after = world.tick(goal=AWAY, fault="it is in a wall")
     assert (goal_of(after), after.note) == (GOAL, "goal there refused: it is in a wall")
     assert (after.request, after.former_goal_um.size, after.goal_set_ns) == (before.request, 0, None)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("at_px", "inside"), [(-0.4, True), (-0.6, False)])
+@pytest.mark.parametrize("far", [False, True])
+def test_a_goal_may_lie_up_to_the_edges_of_the_outermost_pixels(
+    axis: int, at_px: float, inside: bool, far: bool
+) -> None:
+    chip = Chip("field", np.ones((30, 50), bool), 20.0, (), 1.0, 1000.0)
+    place_um = np.array([300.0, 300.0])
+    place_um[axis] = 20.0 * ((49.0, 29.0)[axis] - at_px if far else at_px)
+    event = OperatorEvent(7, "goal", "there", place_um)
+    scene = SimpleNamespace(chip=chip, clearance_um=np.full((30, 50), 100.0, np.float32))
+    fault = _goal_fault(scene, SimpleNamespace(operator=event, stamp_ns=7))  # type: ignore[arg-type]
+    assert fault == ("" if inside else "it is outside the chip")
+    assert _goal_fault(scene, SimpleNamespace(operator=event, stamp_ns=8)) == "", "of an earlier tick"  # type: ignore[arg-type]
 
 
 def test_the_latest_of_several_goals_wins_and_an_answer_to_an_earlier_one_is_never_taken_for_it() -> None:
@@ -200,6 +229,16 @@ def test_a_lower_speed_limit_plans_anew_and_so_does_taking_it_away() -> None:
     assert (fast.phase, fast.planned_um_s, fast.speed_limit_um_s) == ("plan", ROBOT.speed_limit_um_s, None)
     assert world.tick(route=answer(4, GOAL)).phase == "navigate"
     assert world.tick(operator="speed", limit_um_s=590.0).phase == "navigate"  # nothing that matters
+
+
+def test_a_robot_that_becomes_faster_by_itself_keeps_its_way_whatever_a_person_has_set_before() -> None:
+    world = navigating()
+    world.tick(operator="speed", limit_um_s=590.0)
+    world.robot = ROBOT.limited_to(0.5 * 24.0)  # it steps out
+    assert world.tick().wanted == "route"
+    assert world.tick(route=answer(3, GOAL)).phase == "navigate"
+    world.robot = ROBOT
+    assert (world.tick().phase, world.tick().wanted) == ("navigate", "")
 
 
 def test_a_limit_during_an_order_counts_when_it_is_answered() -> None:

@@ -7,7 +7,9 @@ from flowrec.core import Estimate, Route, UsageError
 from flowrec.physics import Robot, clearance_um, sample
 from flowrec.stages import Controller, Planner, load_config
 from flowrec.stages.control.controller import clearance_and_slope
-from flowrec.stages.control.policy import distance_to_known, steepest_descent
+from flowrec.stages.control.delay_compensation import CorrectedFlow
+from flowrec.stages.control.policy import Policy, distance_to_known, steepest_descent
+from flowrec.stages.control.tracking_laws import Situation
 from flowrec.stages.planning.time_field import TimeField
 from flowrec.store import SessionReader
 from flowrec.verbs.record import record
@@ -61,6 +63,24 @@ def test_in_uniform_flow_the_policy_swims_as_zermelo_says(flow):
         best = GOAL_UM - point - flow * zermelo_s(point, flow)
         chosen = steepest_descent(times, PX_UM, point, 100.0, flow / V)
         assert chosen @ best / np.hypot(*best) > np.cos(np.radians(3.0))
+
+
+@pytest.mark.parametrize("flow", [(0.0, 0.0), (300.0, 0.0), (380.0, -380.0)])
+@pytest.mark.parametrize("left_um", [45.0, 60.0, 100.0, 200.0])
+def test_up_to_where_it_holds_the_robot_it_swims_as_zermelo_says_also_from_within_a_radius_of_the_goal(flow, left_um):
+    flow, fine_um = np.array(flow), 5.0
+    corner_um = GOAL_UM - 250.0
+    times = zermelo_s(corner_um + pixels_um() * fine_um / PX_UM, flow).astype(np.float32)
+    route = homeward_route(times, GOAL_UM - corner_um, time_to_go_um_per_px=fine_um)
+    law = Policy(kp_per_s=3.0, hold_radii=0.5)
+    for angle in np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False):
+        point = GOAL_UM + left_um * np.array([np.cos(angle), np.sin(angle)])
+        there, drift = point - corner_um, CorrectedFlow(None, flow)
+        now = Situation(
+            None, mission(), route, seen_at(there), None, drift, SWIMMER, there, V, dt_s=0.033, um_per_px=PX_UM
+        )
+        best = GOAL_UM - point - flow * zermelo_s(point, flow)
+        assert law.reference(now).heading @ best / np.hypot(*best) > np.cos(np.radians(6.0))
 
 
 @pytest.mark.parametrize(("flow", "start"), [((300.0, 0.0), (4200.0, 1000.0)), ((-380.0, 380.0), (700.0, 3900.0))])

@@ -5,11 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import Estimate, Route
+from flowrec.core import Demand, Estimate, Route
 from flowrec.stages import CONTROLLERS, Controller
-from flowrec.stages.control.delay_compensation import corrected_flow
-from flowrec.stages.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback
-from flowrec.stages.control.trajectory import feasible_pace, nearest_time
+from flowrec.stages.control.delay_compensation import CorrectedFlow, corrected_flow
+from flowrec.stages.control.tracking_laws import (
+    FeedforwardFeedback,
+    LiteralFeedforwardFeedback,
+    Situation,
+    compensate_flow,
+)
+from flowrec.stages.control.trajectory import feasible_pace, follow, nearest_time
 from tests.stages.control.plant import ROBOT, field_of, fly, mission, straight
 
 STILL = field_of(lambda x, y: (0.0 * x, 0.0 * y))
@@ -150,6 +155,22 @@ def test_a_route_that_begins_far_away_waits_for_the_robot_at_its_beginning():
     assert run.demands[-1].progress_s > 5.0 and run.demands[-1].error_um < 10.0
 
 
+@pytest.mark.parametrize("behind_um", [0.0, 60.0, 90.0, 120.0, 300.0])
+def test_where_the_reference_will_be_and_how_fast_it_goes_agree_whatever_its_pace(behind_um):
+    route, delay_s = straight(speed_um_s=200.0), 0.2
+    robot, place = replace(ROBOT, delay_s=delay_s), np.array([1500.0 - behind_um, 2500.0])
+    before = Demand(1, np.zeros(2), place, 5.0, 0.0, False, np.zeros((0, 2)))
+    still = CorrectedFlow(None, np.zeros(2))
+    now = Situation(before, mission(), route, seen_at(place, 33_000_001), None, still, robot, place, 600.0, 0.033, 50.0)
+    reference = follow(now, route, 25.0, 150.0, 0.95)
+    paces = np.clip((150.0 - behind_um) / 125.0, 0.0, 1.0)
+    np.testing.assert_allclose(reference.velocity_um_s, [200.0 * paces, 0.0], atol=1e-6)
+    np.testing.assert_allclose(reference.position_um, [1500.0 + 0.033 * 200.0 * paces, 2500.0])
+    np.testing.assert_allclose(
+        reference.future_um - reference.position_um, delay_s * reference.velocity_um_s, atol=1e-6
+    )
+
+
 def test_the_place_on_a_route_nearest_to_a_robot_is_that_of_the_projection():
     route = straight(speed_um_s=300.0)
     assert nearest_time(route, np.array([1234.0, 2700.0])) == pytest.approx((1234.0 - 500.0) / 300.0)
@@ -163,3 +184,35 @@ def test_an_observer_that_knows_the_map_is_not_thought_to_lag_behind_it():
     np.testing.assert_allclose(corrected_flow(corner, corrected, sent, 0.3, 0.0).at(place), [20.0, 330.0], atol=1.0)
     doubted = corrected_flow(corner, corrected, sent, 0.3, 0.3).at(place)
     assert np.hypot(*(doubted - [0.0, 300.0])) < 10.0, "as one that lags it is hardly believed just behind a corner"
+
+
+def test_the_demand_makes_up_for_the_flow_that_an_observer_finds_on_the_map_and_hardly_for_that_of_one_that_lags():
+    corner = field_of(lambda x, y: (300.0 * (x < 2500.0), 300.0 * (x >= 2500.0)))
+    place, sent = np.array([2575.0, 2525.0]), np.array([[400.0, -300.0]])
+    before = Demand(1, sent[0], place, 0.0, 0.0, False, sent)
+    estimate = Estimate(33_000_001, place, np.array([20.0, 330.0]), np.diag([1.0, 1.0, 4.0, 4.0]), 2.0, place, True)
+
+    def made_up_for(knows_map):
+        law = Controller(map_error=0.3, kp_per_s=0.0, observer_lag_s=0.3 * ROBOT.speed_ratio)
+        at_rest = law.control(before, mission(), None, estimate, corner, ROBOT, None, 50.0, estimate_uses_map=knows_map)
+        return -at_rest.velocity_um_s
+
+    assert np.hypot(*(made_up_for(True) - [20.0, 330.0])) < 2.0
+    assert np.hypot(*(made_up_for(False) - [0.0, 300.0])) < 10.0
+
+
+def test_of_all_demands_within_the_limit_that_keep_the_course_the_one_nearest_to_its_speed_is_taken():
+    rng, factors = np.random.default_rng(4), np.linspace(-16.0, 16.0, 64_001)
+    slow = rng.uniform(60.0, 300.0, 150)[:, None] * np.exp(1j * rng.uniform(0.0, 2.0 * np.pi, 150)).view(float).reshape(
+        -1, 2
+    )
+    for wanted, flow in zip(slow, rng.uniform(-400.0, 400.0, (150, 2)), strict=True):
+        demand, limited = compensate_flow(wanted, flow, 300.0)
+        speeds = np.hypot(*(factors[:, None] * wanted - flow).T)
+        able = factors[speeds <= 300.0]
+        assert limited == (np.hypot(*(wanted - flow)) > 300.0)
+        if len(able):
+            best = able[np.argmin(np.abs(able - 1.0))] * wanted - flow
+            np.testing.assert_allclose(demand, best if limited else wanted - flow, atol=0.2)
+        else:  # swept off its course, it opposes the flow as well as it can
+            assert np.hypot(*demand) == pytest.approx(300.0)

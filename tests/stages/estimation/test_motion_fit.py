@@ -10,8 +10,11 @@ import pytest
 
 from flowrec.core import UsageError
 from flowrec.measure import MotionFit
-from flowrec.measure.motion_fit import fit_motion
-from flowrec.measure.motion_search import SearchRange
+from flowrec.measure.calibrate_motion import heading_settings
+from flowrec.measure.motion_fit import _stretches, fit_motion
+from flowrec.measure.motion_regression import Place, TrackRegression
+from flowrec.measure.motion_search import SearchRange, search
+from flowrec.stages import SKIPPED, NoiseModel
 
 ANYWHERE = SearchRange(least_rate=0.7, largest_rate=1.0 / 0.7)
 NEAR = SearchRange(-0.5, 0.5)
@@ -108,6 +111,7 @@ def test_a_late_log_is_found_to_3_ms_in_any_flow(flow, late_s: float) -> None:
     assert not found.refusal and found.rate == 1.0
     assert found.offset_s == pytest.approx(late_s - 0.04, rel=0.0, abs=3e-3)
     assert found.um_per_rev == pytest.approx(K, abs=3.0 * found.um_per_rev_std)
+    assert found.um_per_rev_std > 0.05 * K, "the flow along the way is not known, and changes with the robot's motion"
     assert abs(found.heading_offset_rad) < 3.0 * found.heading_offset_std_rad and not found.mirrored
 
 
@@ -119,6 +123,8 @@ def test_the_rate_of_the_movies_clock_is_found_to_a_thousandth(rate: float) -> N
     assert not found.refusal and found.rate == pytest.approx(rate, rel=1e-3)
     middle_s = float(stamps.mean())
     assert found.offset_s + found.rate * (middle_s / rate + 2.0) == pytest.approx(middle_s - 0.04, abs=3e-3)
+    # A log of commands is late by 0.03 revolutions of 20 Hz at most, at both ends of the movie by another part of them.
+    assert found.rate_std > 2.0 * (0.03 / 20.0) / (14.0 / rate)
 
 
 @pytest.mark.slow("fits a movie to a long log")
@@ -242,3 +248,73 @@ def test_stated_errors_hold() -> None:
     quiet = commands(100, 9.0, fastest_hz=3.0)
     poor = fit_motion(*track(quiet, 0, 8.0, noise_um=2.0), quiet.turns, quiet.span_s, NEAR, exact_log=True)
     assert poor.offset_std_s > 2.0 * np.median(np.array(errors)[:, 0])
+
+
+def test_a_track_that_goes_to_other_things_for_long_is_skipped_for_a_quarter_of_its_frames_at_most() -> None:
+    time_s = np.arange(800) / 30.0
+    positions = np.column_stack([60.0 * time_s, np.zeros(800)]) + np.random.default_rng(0).normal(0.0, 0.3, (800, 2))
+    excursions = {60: 80, 260: 76, 460: 84, 660: 82}  # a tenth of the frames each
+    for first, frames in excursions.items():
+        positions[first : first + frames] += [0.0, 500.0]
+    flags = _stretches(time_s, positions)
+    assert [int((flags[first - 5 : first + 100] == SKIPPED).sum()) for first in excursions] == [80, 76, 0, 0]
+
+
+def test_the_errors_of_a_gain_are_those_of_many_tracks_of_a_robot_whose_speed_and_course_wander() -> None:
+    off, stated = [], []
+    time_s = np.arange(0.0, 8.0, 0.1)
+    for seed in range(100):
+        log, rng = commands(seed, 9.0, hold_s=0.4), np.random.default_rng(seed)
+        wander = np.repeat(rng.normal(0.0, 0.05, (8, 2)) @ [1.0, 1j], 10)
+        steps = np.diff(log.turns(time_s), axis=0) @ [1.0, 1j] * (1.0 + wander[:-1])
+        way = np.concatenate([[0j], np.cumsum(K * steps)]) + rng.normal(0.0, 0.1, (80, 2)) @ [1.0, 1j]
+        positions = np.column_stack([way.real, way.imag])
+        noise = NoiseModel(0.01, 4.0, 3e3)
+        seen = TrackRegression(time_s, positions, np.zeros(80, np.int8), noise, log.turns, (False, False))
+        found = seen.fit(Place(0.0, 1.0, False))
+        off.append((found.gain.real - K, found.gain.imag))
+        stated.append(np.sqrt(np.diag(seen.covariance(found))[2:]))
+    inside = (np.abs(off) < 1.96 * np.array(stated)).mean()
+    assert 0.88 < inside < 0.99
+
+
+def test_a_log_of_another_run_has_a_p_value_below_a_tenth_in_one_search_of_ten_however_many_rates_are_tried() -> None:
+    noise = NoiseModel(0.1, 4.0, 3e4)
+    chances = []
+    for seed in range(24):
+        log, other = commands(2 * seed, 12.0, hold_s=0.4), commands(2 * seed + 1, 12.0, hold_s=0.4)
+        time_s = np.arange(2.0, 10.0, 0.1)
+        positions = K * other.turns(time_s)
+        seen = TrackRegression(time_s, positions, np.zeros(80, np.int8), noise, log.turns, (True, True))
+        chances.append(search(seen, log.span_s, SearchRange(-2.0, 2.0, 0.7, 1.4))[1])
+    assert np.mean(np.array(chances) < 0.1) < 0.25
+    assert np.mean(np.array(chances) < 0.5) > 0.1
+
+
+def test_of_commands_along_one_axis_the_search_leaves_open_whether_the_other_one_is_mirrored() -> None:
+    rng = np.random.default_rng(0)
+    log = Log(np.arange(0.0, 12.0, 0.4), np.column_stack([rng.choice([-15.0, 0.0, 15.0], 30), np.zeros(30)]))
+    time_s = np.arange(2.0, 10.0, 0.1)
+    noise = NoiseModel(0.1, 4.0, 3e4)
+    seen = TrackRegression(time_s, K * log.turns(time_s), np.zeros(80, np.int8), noise, log.turns, (True, False))
+    found = search(seen, log.span_s, SearchRange(-1.0, 1.0))[0]
+    assert {each.mirrored for each in found if abs(each.offset_s) < 0.11} == {False, True}
+
+
+@pytest.mark.parametrize("mirrored_before", [False, True])
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize(("turned_deg", "before_deg"), [(40.0, 0.0), (40.0, 100.0), (-170.0, -60.0), (0.5, 30.0)])
+def test_the_proposed_axes_of_the_headings_are_the_stated_ones_and_then_those_that_the_fit_found(
+    turned_deg: float, before_deg: float, mirrored: bool, mirrored_before: bool
+) -> None:
+    given = dict.fromkeys(MotionFit._fields, 0.0) | {"mirrored": mirrored, "heading_offset_std_rad": 0.01}
+    found = MotionFit(**given | {"heading_offset_rad": math.radians(turned_deg)})  # type: ignore[arg-type]
+    sets = heading_settings(found, before_deg, mirrored_before)
+    offset_deg = sets.get("movie.heading_offset_deg", before_deg)
+    sense = -1.0 if sets.get("movie.heading_mirrored", mirrored_before) else 1.0
+    for log_deg in (-120.0, 10.0, 75.0):
+        stated_deg = before_deg + (-log_deg if mirrored_before else log_deg)
+        true_deg = (turned_deg if turned_deg > 2.0 or turned_deg < -2.0 else 0.0) + stated_deg * (
+            -1.0 if mirrored else 1.0
+        )
+        assert math.cos(math.radians(offset_deg + sense * log_deg - true_deg)) == pytest.approx(1.0, abs=1e-6)

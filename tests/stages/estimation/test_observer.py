@@ -384,3 +384,44 @@ def test_the_luenberger_observer_states_the_variance_that_the_noise_of_the_posit
         flows.append(previous.flow_um_s)
     assert previous is not None
     assert previous.covariance[2, 2] == pytest.approx(np.var(flows[1000:]), rel=0.1)
+
+
+def test_where_the_robot_is_out_of_sight_the_gradient_of_the_flow_is_not_followed_and_the_belief_widens() -> None:
+    last, places = None, 10.0 * np.arange(60)[:, None] * np.array([1.0, 0.0])
+    for index, place in enumerate(places):  # a flow that grows along the way
+        last = Kalman().estimate(last, track(index, place * (1.0 + index / 60.0)), applied(index, np.zeros(2)), ROBOT)
+    assert last is not None and abs(last.slopes_per_s[0]) > 0.1
+    flows, widths = [], []
+    for index in range(60, 70):
+        unseen = track(index, places[-1], seen=False)
+        last = Kalman().estimate(last, unseen, applied(index, np.zeros(2)), ROBOT)
+        flows.append(last.flow_um_s)
+        widths.append(np.sqrt(last.flow_variance))
+    np.testing.assert_allclose(flows[1:], np.tile(flows[0], (9, 1)))  # of the first frame it was seen before
+    assert (np.diff(widths) > 0.0).all()
+
+
+def test_the_own_motion_of_an_estimate_is_that_of_the_um_per_revolution_that_it_states() -> None:
+    observer, turned = Observer("kalman", kalman=Kalman(estimate_gain=True)), np.array([0.3, -0.4])
+    last = observer.estimate(None, track(0, np.zeros(2)), applied(0, np.zeros(2)), ROBOT)
+    known = replace(last, um_per_rev=1.3 * ROBOT.um_per_rev, rolled_um_s=np.zeros(0))
+    driven = replace(applied(1, turned), turns=turned)
+    after = observer.estimate(known, track(1, 1.3 * ROBOT.um_per_rev * turned), driven, ROBOT)
+    assert after.um_per_rev == pytest.approx(1.3 * ROBOT.um_per_rev, rel=0.05)
+    np.testing.assert_allclose(after.rolled_um_s, after.um_per_rev * turned / after.since_s(known))
+
+
+def test_the_error_of_an_observation_grows_with_the_own_motion_alone_and_an_unlikely_position_makes_none() -> None:
+    covariance = np.diag([4.0, 4.0, 9.0, 9.0])  # without memory
+
+    def seen(index: int, place: list[float], flow: list[float], nis: float = 2.0) -> Estimate:
+        position = np.array(place)
+        return Estimate(round(index * 1e9 / RATE_HZ), position, np.array(flow), covariance, nis, position, True)
+
+    sampler = Sampler(rolling_share=0.05, floor_um_s=0.001)
+    for over_ground, own in (([100.0, 0.0], 0.0), ([100.0, 240.0], 240.0), ([0.0, 0.0], 100.0)):
+        places = np.array([[0.0, 0.0], np.array(over_ground) / RATE_HZ])
+        before, now = (seen(n, place.tolist(), [100.0, 0.0]) for n, place in enumerate(places))
+        found = sampler.collect(None, before, now, ROBOT)
+        assert found is not None and found.std_um_s.tolist() == pytest.approx([math.hypot(3.0, 0.05 * own)])
+        assert sampler.collect(None, before, replace(now, nis=25.1), ROBOT) is None

@@ -262,3 +262,24 @@ def test_pumps_that_do_not_fit_the_inlets_are_refused(pump: PumpFollower, tracer
     with pytest.raises(UsageError, match=complaint):
         pump.refuse_unfit(junction(), ("pump",), inertia=False, tracers=tracers)
     TWO.refuse_unfit(junction(), ("pump",), inertia=False, tracers=False)
+
+
+def test_a_sample_that_is_no_number_leaves_the_share_as_it_is() -> None:
+    pump, nothing = PumpFollower("pump/flow", nominal=10.0, smoothing_s=0.0), samples_of(40_000_000, np.nan)
+    first = Tick(0, extra=Tick().extra.with_messages({STREAMS: states_of(), SAMPLES: samples_of(0, 15.0)}))
+    share = pump.follow(Tick(), first)
+    assert share is not None and share.share == 1.5
+    told = replace(first, extra=first.extra.with_messages({PUMP: share}))
+    after = pump.follow(told, Tick(40_000_000, extra=told.extra.with_messages({SAMPLES: nothing})))
+    assert after is not None and after.share == after.slow_share == 1.5
+    assert (
+        pump.follow(Tick(), Tick(0, extra=Tick().extra.with_messages({STREAMS: states_of(), SAMPLES: nothing}))) is None
+    )
+
+
+def test_before_the_first_sample_the_pump_is_taken_to_be_as_it_then_was() -> None:
+    pump = PumpFollower("pump/flow", nominal=10.0, smoothing_s=0.0)
+    last = flown(pump, [15.0] * 50, memory_s=10.0)[-1]
+    assert last is not None
+    began_s, ended_s = np.array([-5.0, -3.0, 0.5, 1.0]), np.array([1.5, -1.0, 1.0, 1.0])
+    np.testing.assert_allclose(pump.mean_share(last, began_s, ended_s), 1.5)

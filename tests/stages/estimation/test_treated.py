@@ -8,8 +8,21 @@ import pytest
 
 from flowrec.core import Applied, Observations, Track, UsageError, as_read
 from flowrec.physics import Robot
-from flowrec.stages import SAMPLERS, Kalman, Observer, Trimmed, observe, smooth
+from flowrec.stages import (
+    RESTART,
+    SAMPLERS,
+    SKIPPED,
+    USED,
+    Kalman,
+    NoiseModel,
+    Observer,
+    Trimmed,
+    observe,
+    smooth,
+    without_jumps,
+)
 from flowrec.stages.estimation import Sampler
+from flowrec.stages.estimation.sampler import _polynomial
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
 DT = 1.0 / 30.0
@@ -99,6 +112,54 @@ def test_the_smoother_is_better_than_the_filter_and_honest_about_it():
     assert 0.8 < np.sqrt((np.concatenate(pulls) ** 2).mean()) < 1.2
     # Neighbours have noise of their own.
     assert np.mean([(p[1:] * p[:-1]).mean() for p in pulls]) < 0.4
+
+
+def test_the_smoother_is_the_least_squares_of_all_frames_at_once():
+    kalman = Kalman(position_noise_um=4.0, flow_noise_um2_s3=2000.0)
+    _, tracks, inputs = swim(3, seconds=0.4)
+    smoothed = smooth(tracks, inputs, kalman, ROBOT)
+    count, estimate = len(tracks), None
+    information, load = np.zeros((4 * count, 4 * count)), np.zeros(4 * count)
+    for k, (seen, done) in enumerate(zip(tracks, inputs, strict=True)):
+        here = slice(4 * k, 4 * k + 4)
+        if estimate is None:
+            estimate = kalman.estimate(None, seen, done, ROBOT)
+            start = np.concatenate([estimate.position_um, estimate.flow_um_s])
+            information[here, here] += np.linalg.inv(estimate.covariance)
+            load[here] += np.linalg.solve(estimate.covariance, start)
+            continue
+        ahead, expected, _, jacobian = kalman.predict(estimate, seen, done, ROBOT)
+        noise = expected - jacobian @ estimate.covariance @ jacobian.T
+        own = ahead - jacobian @ np.concatenate([estimate.position_um, estimate.flow_um_s])
+        step = np.hstack([-jacobian, np.eye(4)])
+        both = slice(4 * k - 4, 4 * k + 4)
+        information[both, both] += step.T @ np.linalg.solve(noise, step)
+        load[both] += step.T @ np.linalg.solve(noise, own)
+        information[here, here] += np.diag([1.0, 1.0, 0.0, 0.0]) / 16.0
+        load[here] += np.append(seen.position_um, [0.0, 0.0]) / 16.0
+        estimate = kalman.estimate(estimate, seen, done, ROBOT)
+    covariance = np.linalg.inv(information)
+    states = (covariance @ load).reshape(count, 4)
+    np.testing.assert_allclose(np.hstack([smoothed.position_um, smoothed.flow_um_s]), states, rtol=1e-6, atol=1e-4)
+    blocks = np.array([covariance[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] for k in range(count)])
+    np.testing.assert_allclose(smoothed.covariance, blocks, rtol=1e-5, atol=1e-4)
+
+
+def test_the_scatter_around_a_polynomial_is_that_of_the_values_however_few_they_are():
+    rng, distance = np.random.default_rng(0), np.linspace(-4.0, 4.0, 6)
+    found = [_polynomial(distance, rng.normal(0.0, 3.0, 6), np.ones(6), 2)[1] for _ in range(2000)]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(3.0, rel=0.06)
+
+
+def test_a_track_that_jumps_and_stays_is_another_stretch_from_where_it_jumped_on():
+    time_s, rng = np.arange(60) * DT, np.random.default_rng(1)
+    places = np.column_stack([100.0 * time_s, 0.0 * time_s]) + rng.normal(0.0, 0.3, (60, 2))
+    places[20] += 50.0
+    places[40:] += 80.0
+    flags = without_jumps(time_s, places, np.zeros(60, np.int8), NoiseModel(0.1, 1.0, 100.0), 8.0)
+    assert np.flatnonzero(flags == SKIPPED).tolist() == [20]
+    assert np.flatnonzero(flags == RESTART).tolist() == [40]
+    assert (np.delete(flags, [20, 40]) == USED).all()
 
 
 def test_the_last_smoothed_frame_is_the_filters():

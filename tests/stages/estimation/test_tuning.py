@@ -29,6 +29,32 @@ def test_the_noise_of_a_parked_robot_is_found_under_its_drift_and_despite_jumps(
     assert np.isnan(parked_noise(tracks, driven)[0])
 
 
+def test_the_drift_that_is_taken_off_a_parked_robot_takes_nothing_off_its_noise() -> None:
+    rng = np.random.default_rng(3)
+    stamps = [round(each * 1e9 / 20.0) for each in range(4000)]
+    places = 2.0 * rng.standard_normal((4000, 2))
+    tracks = [Track(at, True, where, 0.9, 0, 5.0, np.zeros(4)) for at, where in zip(stamps, places, strict=True)]
+    rest = [Applied(at, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2)) for at in stamps]
+    assert parked_noise(tracks, rest)[0] == pytest.approx(2.0, rel=0.07)
+
+
+def test_an_interval_in_which_the_robot_was_driven_is_no_rest() -> None:
+    rng = np.random.default_rng(4)
+    stamps = [round(each * 1e9 / 30.0) for each in range(400)]
+    driven = np.arange(400) % 10 == 9  # and 60 um farther each time
+    places = 60.0 * np.cumsum(driven)[:, None] + rng.standard_normal((400, 2))
+    tracks = [Track(at, True, where, 0.9, 0, 5.0, np.zeros(4)) for at, where in zip(stamps, places, strict=True)]
+    turns = [Applied(at, 0.0, 0.0, 0.0, np.zeros(3), np.full(2, each)) for at, each in zip(stamps, driven, strict=True)]
+    assert np.isnan(parked_noise(tracks, turns)[0]) and parked_noise(tracks, turns)[1] == 0.0
+
+
+def test_a_position_of_something_else_counts_as_one_at_the_gate_and_not_by_its_distance() -> None:
+    run = driven(6.0)
+    tracks = [replace(each, position_um=each.position_um + 500.0 * (n % 20 == 0)) for n, each in enumerate(run.tracks)]
+    tuned = tune(tracks[:80], run.applied[:80], ROBOT, Kalman(position_noise_um=6.0))
+    assert tuned.nis_before <= Kalman().gate_nis
+
+
 def test_tuning_finds_the_noise_of_a_driven_robot_and_brings_the_nis_to_two() -> None:
     run = driven(6.0)
     run.tracks[:] = run.tracks[:600]

@@ -5,6 +5,7 @@ import pytest
 
 from flowrec.stages import Planner, open_space
 from flowrec.stages.planning.free_space import FastFlowMargin
+from flowrec.stages.planning.problem import attach_goal, attach_start
 from tests.stages.planning.worlds import PX, channel, chip_of, downstream, field_of, poiseuille, robot
 
 FAST = FastFlowMargin(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
@@ -81,3 +82,15 @@ def test_against_the_flow_the_time_to_go_leads_as_near_to_the_wall_as_walls_and_
     assert some == pytest.approx(20.0 + 12.0, abs=3.0)
     assert most == pytest.approx(20.0 + 30.0, abs=3.0)
     assert clearance_um(wall_error_um=1e3) == most, "never more than a planned route keeps"
+
+
+def test_a_robot_starts_from_beside_a_wall_and_a_goal_must_be_within_its_radius_of_a_place_with_room():
+    mask = channel(h=40, w=60, wall=8)
+    space = open_space(chip_of(mask), field_of(mask, 0.0), 20.0, 20.0)  # it keeps 4 px from walls, and its radius is 2
+    for clearance_px, near in ((0.7, False), (1.6, False), (2.7, True)):
+        place_um = PX * np.array([30.0, 7.5 + clearance_px])
+        start, goal = attach_start(space, place_um), attach_goal(space, place_um)
+        assert not start.error and start.node >= 0
+        assert bool(goal.error) != near and (goal.node >= 0) == near
+        if near:
+            assert np.hypot(*(space.pixel(goal.node) - place_um / PX)) <= 2.0

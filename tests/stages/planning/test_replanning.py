@@ -86,6 +86,11 @@ def test_a_route_to_another_goal_leaves_the_present_one_at_its_time_and_none_lea
     np.testing.assert_allclose(new.waypoints_um[-1], back, atol=1.0)
     late = route_elsewhere(Planner(), field, present, 1e9, back, chip, SWIMMER)  # at its end
     np.testing.assert_array_equal(late.waypoints_um[: len(present.waypoints_um)], present.waypoints_um)
+    np.testing.assert_array_equal(late.arrival_s[: len(present.arrival_s)], present.arrival_s)
+    at_waypoint = route_elsewhere(Planner(), field, present, float(present.arrival_s[5]), back, chip, SWIMMER)
+    np.testing.assert_array_equal(at_waypoint.arrival_s[:6], present.arrival_s[:6])
+    for each in (late, at_waypoint):
+        assert (np.diff(each.arrival_s) > 0.0).all() and np.hypot(*np.diff(each.waypoints_um, axis=0).T).min() > 0.0
     kept = route_elsewhere(Planner(), field, present, 0.3, np.array([700.0, 450.0]), chip, SWIMMER)
     assert "wall" in kept.reason and kept.goal_um.size == 0
     np.testing.assert_array_equal(kept.waypoints_um, present.waypoints_um)

@@ -38,3 +38,11 @@ def test_what_can_not_be_done_takes_for_ever_from_there_on():
     assert not feasible and arrival[1] == pytest.approx(3.0) and arrival[2] == np.inf
     sideways = field_of(open_water(), 0.0, 150.0)
     assert not travel_time(sideways, np.array([[100.0, 300.0], [400.0, 300.0]]), 100.0)[1]
+
+
+def test_to_stay_where_one_is_takes_no_time_also_where_the_flow_is_faster_than_the_robot():
+    field = field_of(open_water(), lambda x, y: np.where(x > 500.0, -150.0, 0.0))
+    arrival, feasible = travel_time(field, np.array([[800.0, 300.0], [800.0, 300.0]]), 100.0)
+    assert feasible and arrival.tolist() == [0.0, 0.0]
+    path = np.array([[100.0, 300.0], [100.0, 300.0], [200.0, 300.0], [200.0, 300.0]])
+    assert travel_time(field, path, 100.0)[0] == pytest.approx([0.0, 0.0, 1.0, 1.0])

@@ -10,7 +10,7 @@ from flowrec.core import Observations, nearest_pixels
 from flowrec.physics import Doubts, FlowUncertainty, Opening, Registration
 from flowrec.stages import Need, Sampling, SurveyOrder, SurveyPlanner, covariance_after
 from flowrec.stages.planning.survey_design import Looks
-from tests.stages.planning.worlds import PX, chip_of, field_of, length_um, robot
+from tests.stages.planning.worlds import PX, channel, chip_of, field_of, length_um, robot
 
 SPEED_UM_S = 60.0
 STEM, UPPER, LOWER = (300.0, 445.0), (1250.0, 145.0), (1250.0, 745.0)
@@ -100,6 +100,29 @@ def test_observations_that_scatter_more_than_they_state_tell_less_by_the_square_
 
     stated = unknown(chip, field, (0.3, 0.3))
     np.testing.assert_allclose(told(replace(stated, noise_factor=noisier)), told(stated) / noisier**2)
+
+
+@pytest.mark.parametrize("flow_um_s", [0.0, 40.0])
+def test_the_own_motion_of_a_robot_is_as_much_noise_as_it_rolls_uneven(flow_um_s):
+    mask = channel()
+    chip, field = chip_of(mask), field_of(mask, flow_um_s)
+    way, arrival_s = np.array([[100.0, 200.0], [400.0, 200.0], [400.0, 250.0]]), np.array([0.0, 3.0, 3.5])
+    own_um_s = np.hypot(100.0 - flow_um_s, 0.0), np.hypot(flow_um_s, 100.0)  # of 100 um/s over ground
+
+    def told(sampling, leg):
+        looks = Looks.none(unknown_flow(chip, field), sampling, chip, 30.0, 0.05)
+        return looks.information(way[leg : leg + 2], arrival_s[leg : leg + 2])
+
+    for leg, own in enumerate(own_um_s):
+        uneven, noisy = Sampling(20.0, 0.0, 3.0, 0.05), Sampling(20.0, 0.0, float(np.hypot(3.0, 0.05 * own)))
+        np.testing.assert_allclose(told(uneven, leg), told(noisy, leg))
+
+
+def unknown_flow(chip, field):
+    """A uniform flow of unknown size."""
+    mean = field.velocity_um_s[chip.mask].astype(float)
+    nothing = np.zeros((0, len(mean)))
+    return FlowUncertainty(mean, np.ones((1, *mean.shape)), nothing, 100.0 * np.eye(1), np.full(len(mean), 2.0))
 
 
 def upper_part(chip, field):

@@ -192,6 +192,15 @@ def test_a_sphere_between_walls_follows_published_limits():
     assert middle.transport_slip(v, laplacian)[0] == pytest.approx([-90.0 * 0.25 / 3.0, 0.0])
 
 
+def test_a_sphere_that_is_seen_nearer_to_a_wall_than_its_radius_touches_it_and_never_the_one_behind_it():
+    width = np.full(5, 12.0)
+    seen = SphereBetweenWalls.of(4.0, np.array([-1.0, 0.5, 3.0, 3.9, 4.0]), width)
+    touching = SphereBetweenWalls.of(4.0, np.full(5, 4.0), width)
+    np.testing.assert_array_equal([seen.drag, seen.lag], [touching.drag, touching.lag])
+    narrow = SphereBetweenWalls.of(4.0, np.array([2.0]), np.array([5.0]))
+    assert narrow.far_px == narrow.near_px == 4.0 and narrow.lag == 0.0
+
+
 def test_the_width_of_a_channel_is_that_at_the_place_up_to_its_corners():
     mask = np.zeros((60, 80), bool)
     mask[5:11] = mask[20:50] = True  # channels of 6 and 30 pixels
@@ -210,6 +219,24 @@ def test_hindrance_and_lag_are_those_of_a_sphere_where_its_radius_is_stated(twin
     refined = SETTINGS.refine(case.assumed, replace(observed, radius_um=25.0), case.chip, case.solver)
     assert "sphere_share" in refined.parameter_names and "carry_share" not in refined.parameter_names
     assert case.error(refined) < 0.04
+
+
+@pytest.mark.parametrize("radius_um", [None, 20.0])
+def test_tracers_beside_a_wall_do_not_change_what_the_walls_do_to_the_robot(twin, radius_um):
+    case, settings = twin(), SETTINGS.assimilate
+    model = flow_model(settings, settings.model, case.chip, case.solver)
+    robot = replace(flown(case), radius_um=radius_um)
+    beside_um = np.column_stack([np.linspace(30.0, 180.0, 9), np.full(9, 208.0)])
+    beads = Observations(0, beside_um, np.ones((9, 2)), np.ones(9), None, np.arange(9.0), tracer=np.arange(9.0))
+
+    def seen(made):
+        return Observed.of(model, observation_operator(made, case.chip.mask, 10.0, case.assumed.wall_px))
+
+    alone, both = seen(robot), seen(robot.with_tracers(beads))
+    count = alone.operator.count
+    assert both.operator.count == count + 9
+    np.testing.assert_allclose(both.near[:count], alone.near)
+    assert both.least_px == alone.least_px
 
 
 def test_what_a_robot_rolls_is_found_as_a_line_over_the_drag_of_the_side_walls(twin):

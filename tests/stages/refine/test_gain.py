@@ -33,3 +33,13 @@ def test_a_flow_that_no_factor_explains_widens_the_error_bars_in_proportion_to_t
     # 20 % on one of two components.
     assert np.median(share) == pytest.approx(0.2 / np.sqrt(2.0), rel=0.2)
     assert np.median(share) * np.sqrt(2.0) == pytest.approx(refined.error_share, rel=0.1)
+
+
+def test_the_boundary_values_that_it_states_are_those_of_its_flow(twin):
+    case = twin(truth=(130.0, 0.0, 0.0), assumed=(100.0, 0.0, 0.002))
+    refined = Refiner("gain").refine(case.assumed, case.observations, case.chip, case.solver)
+    solved = case.solver.solve(case.chip.with_boundary(refined.boundary_values))
+    assert not np.allclose(refined.boundary_values, case.assumed.boundary_values, rtol=0.05)
+    for name in ("velocity_um_s", "pressure_pa"):
+        values = getattr(solved, name)
+        np.testing.assert_allclose(getattr(refined, name), values, atol=1e-3 * np.abs(values).max())

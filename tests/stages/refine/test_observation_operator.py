@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import nearest_pixels
+from flowrec.core import as_read, nearest_pixels
 from flowrec.core.messages import Observations
 from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
@@ -109,3 +109,38 @@ def test_the_noise_of_exact_observations_is_what_a_coarse_grid_gets_wrong_of_the
     misfit = operator.misfit(coarse.velocity_um_s)
     # Two would be right, ten times more or less another statement. (Measured: 0.23, a third of the stated error.)
     assert 0.1 < misfit.mean() < 4.0
+
+
+@pytest.mark.parametrize("name", ["position_um", "flow_um_s", "std_um_s", "rolled_um_s", "time_s"])
+def test_an_observation_that_is_not_finite_in_anything_is_left_out_and_counted(name):
+    given = observed_along(12)
+    values = getattr(given, name).copy()
+    values[3] = np.nan
+    with as_read():  # of a session from before such numbers were refused
+        broken = replace(given, **{name: values})
+    operator = observation_operator(broken, np.ones((20, 30), bool), 10.0, None)
+    assert operator.count == 11 and operator.ignored == "1 without finite numbers"
+    for array, whole in ((operator.time_s, given.time_s), (operator.rolled_um_s, given.rolled_um_s)):
+        np.testing.assert_array_equal(array, np.delete(whole, 3, axis=0))
+    negative = replace(given, std_um_s=np.where(np.arange(12) == 5, -1.0, 2.0))
+    assert observation_operator(negative, np.ones((20, 30), bool), 10.0, None).count == 11
+
+
+def test_an_observation_that_is_given_twice_counts_once_and_two_at_one_place_twice():
+    given = observed_along(12)
+    again = given.followed_by(given.only(slice(4, 9)))
+    elsewhen = replace(given.only(slice(2, 3)), flow_um_s=np.array([[7.0, 7.0]]))
+    operator = observation_operator(again.followed_by(elsewhen), np.ones((20, 30), bool), 10.0, None).distinct()
+    assert operator.count == 13
+    whole = given.followed_by(elsewhen)
+    for name in ("flow_um_s", "std_um_s", "rolled_um_s", "time_s"):
+        np.testing.assert_array_equal(getattr(operator, name), getattr(whole, name))
+    np.testing.assert_array_equal(operator.points, whole.position_um / 10.0)
+    assert len(operator.pixels) == len(operator.weights) == 13
+
+
+def observed_along(count):
+    """Observations along a line, all different."""
+    n = np.arange(count, dtype=float)
+    position, flow = np.column_stack([50.0 + 10.0 * n, 80.0 + n]), np.column_stack([100.0 + n, -n])
+    return Observations(0, position, flow, 2.0 + 0.1 * n, -flow, 0.5 * n)

@@ -14,7 +14,7 @@ from flowrec.stages.refine.causes import HEIGHT_S, Observed
 from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.noise import MOST_OBSERVATIONS, groups
 from flowrec.stages.refine.observation_operator import observation_operator
-from flowrec.stages.refine.tracer_heights import LEAST_PX, MEAN, MOST, SCATTER, at_mean_height
+from flowrec.stages.refine.tracer_heights import LEAST_PX, MEAN, MOST, SCATTER, VARIES_SHARE, at_mean_height
 
 SOLVER = FlowSolver()
 DUCT = replace(load_chip(ChipSettings(name="straight")), depth_um=150.0)
@@ -80,12 +80,17 @@ def test_what_the_robot_observed_is_left_as_it_is_and_some_of_the_tracers_are_us
     beads = of_beads(200, 1, each=10)
     own = beads.only(slice(0, 7))
     robot = replace(own, rolled_um_s=own.flow_um_s, radius_um=50.0, tracer=None, entered=None)
-    joined = robot.with_tracers(beads)
+    joined = robot.with_tracers(replace(beads, stamp_ns=robot.stamp_ns + 5))
+    assert joined.stamp_ns == robot.stamp_ns, "by it the next observation of the robot is due"
     assert joined.radius_um == 50.0 and not joined.rolled_um_s[7:].any() and (joined.tracer[:7] == -1.0).all()
     found = at_mean_height(joined, ASSUMED, DUCT)
     assert found.only(slice(0, 7)).flow_um_s.tolist() == robot.flow_um_s.tolist()
     assert found.std_um_s[:7].tolist() == robot.std_um_s.tolist()
     assert len(found.std_um_s) == 7 + MOST
+    chosen = [int(np.flatnonzero(joined.time_s == at_s)[0]) for at_s in found.time_s[7:]]
+    np.testing.assert_allclose(found.flow_um_s[7:], joined.flow_um_s[chosen] / MEAN)
+    varied = VARIES_SHARE * np.hypot(*found.flow_um_s[7:].T)
+    np.testing.assert_allclose(found.std_um_s[7:], np.hypot(joined.std_um_s[chosen] / MEAN, varied))
     assert np.histogram(found.time_s[7:], 6, (0.0, beads.time_s[-1]))[0] == pytest.approx(MOST / 6, abs=1), (
         "at all times"
     )

@@ -17,8 +17,8 @@ from flowrec.bench.robot_tracking import by_flowrec, recorded_movies, row
 from flowrec.core import Appearance, Frame, Track
 from flowrec.physics import Calibration, Chip, Robot
 from flowrec.stages import Tracker, calibration_of, load_config
-from flowrec.stages.vision.assignment import ExpectedMotion, assign_objects
-from flowrec.stages.vision.learned import Candidates
+from flowrec.stages.vision.assignment import ExpectedMotion, assign_objects, hidden_neighbours, with_motion
+from flowrec.stages.vision.learned import VIEWS, Candidates, ForegroundRegion, ReducedScale, updated_look
 from flowrec.store import SessionReader
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.record import record
@@ -321,3 +321,60 @@ def test_far_from_where_it_is_expected_the_robot_must_be_the_only_one_of_its_loo
     before = Track(0, True, np.zeros(2), 0.9, 0, 6.0, np.zeros(4), energy=30.0)
     expected = ExpectedMotion(before, np.zeros(2), 6.0, 0.1, np.array([100.0, 100.0]), 3.0)
     assert Tracker()._is_robot(found, 0, expected, 20.0) is is_robot
+
+
+def bodies(*rows: tuple[float, float, float, float]) -> Candidates:
+    """Candidates by x, y, energy and similarity."""
+    x, y, energy, similarity = np.array(rows, float).reshape(-1, 4).T
+    px = np.column_stack([x, y])
+    return Candidates(px, px, energy, np.zeros(len(rows), np.intp), similarity, px)
+
+
+def followed(*neighbours: tuple[float, float, float], velocity=(0.0, 0.0)) -> ExpectedMotion:
+    """The motion of a robot of energy 40 at (100, 100), beside neighbours by x, y and energy."""
+    last = Track(0, True, np.zeros(2), 0.9, 0, 5.0, np.zeros(4), velocity_px_s=np.array(velocity), spread_px=2.0)
+    last = replace(last, energy=40.0, neighbours_px=np.array(neighbours, float).ravel())
+    return ExpectedMotion.after(last, np.array([100.0, 100.0]), 6.0, 0.04)
+
+
+@pytest.mark.parametrize("brighter", [0.4, 2.5])
+def test_a_neighbour_keeps_its_own_energy_so_that_the_robot_is_not_taken_for_it(brighter: float) -> None:
+    motion = followed((104.0, 100.0, 40.0 * brighter))
+    # Both went as far to the side; the look of the neighbour is a little more like the robot's.
+    for robot_first in (True, False):
+        both = [(102.0, 103.0, 40.0, 0.88), (102.0, 97.0, 40.0 * brighter, 0.92)]
+        which, missed = assign_objects(bodies(*(both if robot_first else both[::-1])), motion, 50.0)
+        assert which == (0 if robot_first else 1) and not len(missed)
+
+
+def test_a_neighbour_that_is_hidden_fades_and_is_forgotten() -> None:
+    hidden, energies = np.array([[101.0, 99.0, 40.0], [130.0, 99.0, 40.0]]), []
+    for _ in range(40):
+        hidden = hidden_neighbours(hidden, np.array([100.0, 100.0]), 6.0)
+        energies += hidden[:, 2].tolist()
+    assert not len(hidden) and energies[0] < 40.0 and (np.diff(energies) < 0.0).all() and len(energies) > 5
+
+
+def test_the_velocity_of_a_robot_follows_its_places_slowly_and_one_wrong_place_hardly_moves_it() -> None:
+    motion = followed(velocity=(50.0, 0.0))
+    went = with_motion(motion.previous, motion, np.array([102.0, 110.0]), 40.0)
+    # 2 px along its velocity in 40 ms, and 10 px across by mistake.
+    assert went.velocity_px_s.tolist() == pytest.approx([50.0, 0.3 * 250.0])
+    assert went.energy == pytest.approx(40.0)
+
+
+def test_of_ever_new_looks_of_a_robot_the_first_and_the_newest_are_kept_and_never_more_than_eight() -> None:
+    rng, scale = np.random.default_rng(0), ReducedScale(6.0)
+    size = len(scale.window())
+    pictures = rng.normal(0.0, 10.0, (20, 40, 40)).astype(np.float32)
+    look = Appearance(0, "mixed", 1.0, 0.0, 6.0, np.array([20.0, 20.0]), pictures[0, :size, :size][None])
+    seen = []
+    for n, picture in enumerate(pictures):
+        region = ForegroundRegion(picture, 0.0, 0.0, scale)
+        look = updated_look(region, np.array([20.0, 20.0]), look, 0.3, True, n * 10**9)
+        half = size // 2
+        seen.append(picture[20 - half : 21 + half, 20 - half : 21 + half])
+    assert len(look.views) == VIEWS
+    np.testing.assert_array_equal(look.views[0], pictures[0, :size, :size])
+    np.testing.assert_allclose(look.views[1], seen[-1])
+    assert all(any(np.allclose(view, each) for each in seen) for view in look.views[2:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import flowrec
 from flowrec.core import Shift, Track
 from flowrec.physics import Chip
 from flowrec.stages import Tracker, load_config
+from flowrec.stages.sight import Sight, look
 from flowrec.stages.vision import Stabiliser, move_neighbours
 from flowrec.stages.vision.walls import Walls
 from tests.short_missions import SMALL
@@ -132,3 +134,18 @@ def test_a_simulated_mission_on_a_shaking_stage_has_the_track_of_one_that_rests(
     # The first image is the reference, so all lie off by as much as that one: only the sway is taken out.
     assert sway_px["true"] < 0.1 < 1.0 < sway_px["false"]
     assert flowrec.replay(tmp_path / "true.mcap", verify=True).same
+
+
+def test_the_neighbours_of_the_image_before_are_moved_by_what_the_image_moved_since():
+    before, now = (Shift(n, np.array(px), found=True, alike=1.0) for n, px in enumerate(([5.0, -2.0], [6.5, -1.0])))
+    neighbours = np.array([100.0, 50.0, 8.0, 30.0, 40.0, 9.0])
+    track = Track(0, True, np.zeros(2), 0.9, 0, 5.0, np.zeros(4), neighbours_px=neighbours)
+    given = []
+    scene = SimpleNamespace(
+        stabiliser=SimpleNamespace(register=lambda *_: (now, None)),
+        tracker=SimpleNamespace(count=1, tracers=False, follow=lambda *all_: given.extend(all_) or (track, None)),
+        **dict.fromkeys(("chip", "calibration", "robot", "mission")),
+    )
+    look(scene, Sight(track=track, shift=before), None)
+    assert given[0].neighbours_px.tolist() == [101.5, 51.0, 8.0, 31.5, 41.0, 9.0]
+    assert tuple(given[-1]) == (6.5, -1.0)

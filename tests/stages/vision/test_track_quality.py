@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import Appearance, Extra, Tick, Track
+from flowrec.core import Appearance, Extra, Shift, Tick, Track
 from flowrec.stages import TrackQuality
 from tests.stages.vision.shaky import CALIBRATION, HEIGHT, ROBOT, UM_PER_PX, WIDTH
 
@@ -105,3 +105,12 @@ def test_a_round_body_that_turns_into_a_ring_is_doubted_and_one_that_stays_is_no
         look = Appearance(0, "dark", 1.0, 1.0, 5.0, np.zeros(2), views)
         found = doubts(tracks(), [look] * 60)
         assert [("no longer looks" in each) for each in found] == [True] * count
+
+
+@pytest.mark.parametrize(("moved_px", "cut"), [((0.0, 0.0), True), ((40.0, 0.0), False), ((0.0, 40.0), True)])
+def test_the_border_is_that_of_the_image_which_may_lie_elsewhere_than_the_chip(moved_px, cut) -> None:
+    quality = TrackQuality(CALIBRATION, (HEIGHT, WIDTH), ROBOT)
+    for track in tracks(step_px=0.0):
+        beside = replace(track, position_um=track.position_um - UM_PER_PX * np.array([60.0, 0.0]))
+        quality.take(beside, None, Shift(track.stamp_ns, np.array(moved_px), found=True, alike=1.0))
+    assert bool(quality.doubts()) == cut

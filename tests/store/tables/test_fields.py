@@ -37,6 +37,7 @@ def test_a_field_and_its_error_are_drawn_without_the_true_flow() -> None:
 
     mpl.use("agg")
     import matplotlib.pyplot as plt
+    from matplotlib.quiver import Quiver
 
     session = flowrec.open(GOLDEN)
     field = session.fields["refined"]
@@ -49,6 +50,12 @@ def test_a_field_and_its_error_are_drawn_without_the_true_flow() -> None:
         assert vectors is not None
         drawn = np.ma.filled(np.ma.masked_invalid(image.get_array()), 0.0)
         assert np.allclose(drawn, np.where(session.chip.mask, np.hypot(*np.moveaxis(vectors, -1, 0)), 0.0))
+        arrows = [each for each in axes.collections if isinstance(each, Quiver)]
+        assert len(arrows) == (show == "speed")
+        for each in arrows:
+            columns, rows = np.rint(each.get_offsets() / field.um_per_px).astype(int).T
+            assert session.chip.mask[rows, columns].all()
+            assert np.array_equal(np.column_stack([each.U, each.V]), field.velocity_um_s[rows, columns])
         assert axes.yaxis_inverted() and axes.lines[0].get_xydata().tolist() == path_um.tolist()
         axes.figure.canvas.draw()
         plt.close(axes.figure)
