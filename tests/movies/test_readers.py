@@ -4,6 +4,7 @@ import json
 import struct
 import sys
 import zlib
+from dataclasses import fields, replace
 
 import av
 import cv2
@@ -13,7 +14,8 @@ import tifffile
 import zstandard
 
 from flowrec.core import MovieError
-from flowrec.movies import ReadOptions, ome, open_movie
+from flowrec.movies import MovieNotes, ReadOptions, ome, open_movie
+from flowrec.movies.notes import notes_in
 from flowrec.rigs import MovieRig, MovieSource
 from flowrec.stages import Coils
 from flowrec.stages.config import MovieSettings
@@ -377,3 +379,32 @@ def test_a_zarr_whose_chunks_hold_nothing_or_unpack_without_measure_is_refused(t
         chunk.write_bytes(packed)
     with pytest.raises(MovieError, match=r"bomb\.zarr: .*3\.2 GB"):
         read(bomb)
+
+
+@needs("nd2")
+@pytest.mark.parametrize(("compression", "lossy"), [(0, False), (1, True), (2, False)])  # as ND2 numbers them
+def test_a_nikon_file_says_whether_its_levels_were_changed(compression, lossy, tmp_path):
+    path = makers.nd2(tmp_path / "a.nd2", pictures(12), np.arange(COUNT) / 30, compression=compression)
+    with open_movie(path) as movie:
+        assert movie.facts.lossy is lossy
+
+
+def test_the_time_of_an_image_of_several_planes_is_that_of_the_first():
+    times_s = [[0.0, 0.3, 0.5], [1.0, 1.3, 1.5]]
+    planes = "".join(
+        f'<Plane TheC="{c}" TheZ="0" TheT="{t}" DeltaT="{time_s}"/>'
+        for t, of_image in enumerate(times_s)
+        for c, time_s in enumerate(of_image)
+    )
+    facts = ome.ome_facts(ome.parse_ome(f"<OME><Pixels>{planes}</Pixels></OME>"), 2)
+    assert facts.times_s.tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("um_per_px", [0, -2.0, float("nan"), float("inf"), 1e9, None, "2"])
+def test_a_scale_that_no_pixel_can_have_is_damage_of_the_notes(um_per_px):
+    given = dict.fromkeys((each.name for each in fields(MovieNotes) if each.type == "str"), "")
+    given |= {each.name: 8 for each in fields(MovieNotes) if each.type == "int"} | {"drawn": False}
+    notes = MovieNotes(**given, um_per_px=2.0)
+    assert notes_in(notes.text(), makers.Path("a.mp4")) == notes
+    with pytest.raises(MovieError, match="um_per_px is"):
+        notes_in(replace(notes, um_per_px=um_per_px).text(), makers.Path("a.mp4"))

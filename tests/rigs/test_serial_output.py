@@ -39,7 +39,7 @@ class Device(TerminalTwin):
 
     def answer(self, line: str) -> None:
         if line.endswith("?"):
-            self.send(f"{line[:-1]} {self.state[line[:-1]]:.3e} V\r\n")
+            self.send(f"{line[:-1]} {self.state[line[:-1]]:.3e} V\r\nREADY 9\r\n")  # of which nobody takes the second
         else:
             name, value = line.split()
             self.state[name] = min(float(value), 3.0 if name == "VOLT" else 1e9)

@@ -360,3 +360,20 @@ def test_a_chunk_is_sealed_before_it_outgrows_what_a_reader_takes_and_no_message
     assert len(chunks) == 6 and all(80_000 < chunk.uncompressed_size < 101_000 for chunk in chunks)
     with pytest.raises(SessionError, match=r"/camera/frame .*\d+ bytes"):
         write_session(tmp_path / "y.mcap", ticks_of(1, shape=(400, 300)), frames="raw")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a system call of POSIX")
+def test_a_system_call_that_writes_a_part_of_what_it_is_given_is_followed_by_one_that_writes_the_rest(
+    tmp_path, monkeypatch
+):
+    write, rng = os.writev, np.random.default_rng(5)
+
+    def partly(handle, buffers):
+        taken = int(rng.integers(1, 1 + sum(map(len, buffers))))
+        return write(handle, [b"".join(buffers)[:taken]])
+
+    monkeypatch.setattr(os, "writev", partly)
+    path = write_session(tmp_path / "s.mcap", TICKS)
+    monkeypatch.undo()
+    assert all(same(one, other) for one, other in zip(SessionReader(path).ticks(), TICKS, strict=True))
+    assert digest_faults(path) == {path: []}

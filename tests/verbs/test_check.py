@@ -213,8 +213,10 @@ def test_a_jump_of_the_wall_clock_is_told_and_does_no_harm(tmp_path, jump_s):
     # The draft's head says that both clocks read 1 ns at its beginning.
     ended = ending(outcome="reached", monotonic_ns=str(10**14), wall_ns=str(10**14 + jump_s * 10**9))
     path = file_of(tmp_path, replace(small_draft(), tail=ended))
-    said = [text for about, text in found(check(path)) if about == "clocks"]
+    verdict = check(path)
+    said = [text for about, text in found(verdict) if about == "clocks"]
     assert len(said) == bool(jump_s) and all(f"{jump_s:+.1f} s" in text for text in said)
+    assert f" {1000 * jump_s:+d} ms apart" in verdict.facts["clocks"]
     assert [tick.stamp_ns for tick in SessionReader(path).ticks()] == [10**9 + i * PERIOD_NS for i in range(TICKS)]
 
 

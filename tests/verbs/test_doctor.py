@@ -142,6 +142,16 @@ def test_a_disk_is_judged_by_what_the_camera_delivers(
     assert levels(load_config(None, ["camera.rate_hz=20.0", "recording.admission_s=0"]), tmp_path)["disk"] == level
 
 
+@pytest.mark.parametrize(("free_gb", "level"), [(105.0, OK), (101.0, WARNING), (99.0, WARNING)])
+def test_a_disk_has_room_down_to_the_floor_at_which_a_run_is_ended(
+    free_gb: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _folder: SimpleNamespace(free=free_gb * 1e9))
+    asked = ["camera.rate_hz=20.0", "recording.admission_s=0", "recording.disk_floor_gb=100.0"]  # 2.2 GB in 10 minutes
+    assert levels(load_config(None, asked), tmp_path)["disk"] == level
+
+
 @pytest.mark.slow("flies the rehearsal of a mission")
 def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path) -> None:
     assert levels(load_config(), tmp_path)["kernels"] == OK

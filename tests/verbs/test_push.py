@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -165,6 +166,22 @@ def test_what_another_upload_has_left_is_not_taken_for_ours(server: S3Server, la
     assert content(server, "large.mcap") == data
     assert len(sent_parts(server)) == LARGE_PARTS - 1
     assert [each["UploadId"] for each in client.list_multipart_uploads(Bucket=BUCKET)["Uploads"]] == [foreign]
+
+
+def test_the_upload_that_was_interrupted_last_goes_on_however_many_others_have_left_before(large: Path) -> None:
+    data = large.read_bytes()
+    ages = {f"{age:02d}": data if age < 2 else bytes(len(data)) for age in range(20)}  # the two last ones are of ours
+
+    def answer(verb: str, UploadId: str = "", **_words: object) -> dict[str, object]:
+        if verb == "list_multipart_uploads":
+            times = {age: datetime(2026, 1, 1, tzinfo=UTC) - timedelta(hours=int(age)) for age in ages}
+            return {"Uploads": [{"Key": "x", "UploadId": age, "Initiated": times[age]} for age in sorted(ages)[::-1]]}
+        md5 = hashlib.md5(ages[UploadId][:PART_BYTES], usedforsecurity=False).hexdigest()
+        return {"Parts": [{"PartNumber": 1, "Size": PART_BYTES, "ETag": f'"{md5}"'}]}
+
+    with bucket_upload.LocalParts(large) as parts:
+        parts.part_bytes = PART_BYTES
+        assert bucket_upload._Upload(answer, "x", parts)._find_interrupted() == "00"
 
 
 @pytest.mark.slow("waits for a server in trouble")

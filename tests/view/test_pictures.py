@@ -27,6 +27,7 @@ from flowrec.view import (
     maps,
     registration_remark,
 )
+from flowrec.view.drawing import encode_jpeg
 from flowrec.view.entities import TIME_TO_GO
 from flowrec.view.logger import TickLogger
 from flowrec.view.summary_text import LiveSummary
@@ -347,3 +348,11 @@ def test_a_map_that_comes_later_says_so_until_it_is_there(scene: Scene, ticks: l
     logger.log(Tick(1, assumed=field))
     assert isinstance(record.logged[assumed], rr.Clear)
     assert not isinstance(record.logged[refined], rr.Clear)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_a_preview_of_a_deep_image_has_its_upper_8_bits(bits: int) -> None:
+    levels = np.linspace(0, 2**bits - 1, 256).round().astype(np.uint8 if bits == 8 else np.uint16)
+    image = np.repeat(levels[None], 64, axis=0)
+    seen = cv2.imdecode(np.frombuffer(encode_jpeg(image, bits, 95), np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(seen.astype(float), image >> (bits - 8), atol=2.0)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from flowrec.core import Currents, RigError, UsageError
-from flowrec.physics import Robot
+from flowrec.physics import ChipSettings, Robot, load_chip
 from flowrec.rigs import CommandLimits, Guardian
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.rigs.lab.guardian import watch
-from flowrec.stages import Coils, FieldCommand, OutputLimits
+from flowrec.stages import Coils, FieldCommand, OutputLimits, load_config, resolve
 
 ON, OFF, TRIP, QUIT, PROBE = b"1", b"0", b"T", b"Q", b"P"
 
@@ -190,3 +190,15 @@ def test_an_amplifier_whose_timer_is_shorter_than_two_beats_is_refused() -> None
     told.timer_s = 1.9 * BEAT_S
     with pytest.raises(UsageError, match=r"0\.02 s; .*0\.04 s"), driven(told, Clock()):
         pytest.fail("it opened")
+
+
+def test_a_loop_may_wait_as_long_as_the_watchdog_of_its_ticks_allows_before_the_guardian_hears_it_no_more() -> None:
+    told: list[float] = []
+
+    class Asked(Drive):
+        def __init__(self, amplifier: object, limits: CommandLimits, silence_s: float, patience_s: float) -> None:
+            told.extend((silence_s, patience_s))
+
+    config = resolve(load_config(None, ["safety.guard_timeout_s=0.7", "lab.guardian_s=0.2"]), load_chip(ChipSettings()))
+    Asked.of(config)
+    assert told == [0.2, pytest.approx(0.9)]
