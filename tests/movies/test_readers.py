@@ -297,6 +297,14 @@ def test_the_early_end_of_a_movie_is_what_its_rig_noticed_while_it_played(tmp_pa
         assert len(rig.noticed) == 1 and "first 5 images" in rig.noticed[0]
 
 
+def test_of_a_movie_that_is_played_for_a_time_the_image_at_its_end_is_the_last(tmp_path):
+    folder = makers.folder(tmp_path / "pngs", pictures(count=4))
+    for duration_s, count in ((None, 4), (0.2, 3), (0.19, 2), (0.0, 1)):
+        source = MovieSource(MovieSettings(path=str(folder), rate_hz=10.0), Coils())
+        with MovieRig(source, 0.0, duration_s) as rig:
+            assert len(list(rig.inputs())) == rig.taken == rig.images == count
+
+
 def test_samples_of_more_bits_than_an_image_can_have_are_refused(tmp_path):
     path = makers.folder(tmp_path / "pngs", pictures())
     with open_movie(path) as movie, pytest.raises(MovieError, match=r"32 bits.*ffm"):

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tifffile
+import zarr
 
 import flowrec
 from flowrec.core import Frame, SessionError
@@ -106,3 +107,14 @@ def test_the_scale_of_grey_levels_is_that_of_what_was_recorded_where_the_rest_is
     grey = GreyScale.of(session, frame)  # type: ignore[arg-type]
     assert 900 <= grey.low < 905 and 1295 < grey.high <= 1300
     assert grey(window)[0, 0] == 0 and np.ptp(grey(window)[20:40, 30:60]) == 255
+
+
+def test_an_ome_zarr_whose_levels_are_scaled_together_has_the_product_of_both_scales_along_x(tmp_path: Path) -> None:
+    path = makers.ome_zarr(tmp_path / "a.zarr", [np.ones((48, 64), np.uint8)] * 3, 0.07, axes="tyx")
+    group = zarr.open_group(path, mode="r+")
+    ome = dict(group.attrs["ome"])
+    ome["multiscales"][0]["coordinateTransformations"] = [{"type": "scale", "scale": [10.0, 3.0, 2.0]}]
+    group.attrs["ome"] = ome
+    with open_movie(path) as movie:
+        assert movie.facts.um_per_px == 5.0
+        np.testing.assert_allclose(np.diff(1e-9 * movie.facts.times_ns), 0.7)

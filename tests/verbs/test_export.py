@@ -7,6 +7,7 @@ import json
 import os
 import resource
 import shutil
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 
@@ -212,3 +213,27 @@ def test_view_keeps_the_recording_of_an_unchanged_session_and_writes_that_of_a_c
         view(path, no_open=True)
     rrd.unlink()
     assert written_anew()
+
+
+def test_an_export_is_kept_until_what_it_is_made_of_or_the_code_that_made_it_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exporting = import_module("flowrec.exports.export")  # whose function has its name
+    code, session = tmp_path / "code" / "a.py", tmp_path / "s.mcap"
+    code.parent.mkdir()
+    for file in (code, session):
+        file.write_text("x")
+    monkeypatch.setattr(exporting, "PACKAGE", code.parent)
+    known = {exporting._made_from((session,))}
+    assert known == {exporting._made_from((session,))} and exporting._made_from(()) == ""
+    changes = (
+        lambda: code.write_text("xy"),
+        lambda: session.write_text("xy"),
+        lambda: os.utime(session, ns=(1, 1)),
+        lambda: code.with_name("b.py").write_text("x"),
+        session.unlink,
+    )
+    for number, change in enumerate(changes, 2):
+        change()
+        known.add(exporting._made_from((session,)))
+        assert len(known) == number

@@ -26,6 +26,7 @@ from flowrec.view import (
     flow_values,
     maps,
     registration_remark,
+    scale_of,
 )
 from flowrec.view.drawing import encode_jpeg
 from flowrec.view.entities import TIME_TO_GO
@@ -356,3 +357,17 @@ def test_a_preview_of_a_deep_image_has_its_upper_8_bits(bits: int) -> None:
     image = np.repeat(levels[None], 64, axis=0)
     seen = cv2.imdecode(np.frombuffer(encode_jpeg(image, bits, 95), np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_allclose(seen.astype(float), image >> (bits - 8), atol=2.0)
+
+
+@pytest.mark.parametrize("table", ["speed", "uncertainty", "change", "time"])
+def test_a_scale_reaches_to_all_but_a_hundredth_of_a_map_and_not_far_beyond(table: Any) -> None:
+    rng = np.random.default_rng(11)
+    for size in 10.0 ** np.arange(-3, 5):
+        values = (
+            size * np.abs(rng.normal(size=(40, 50))) * (rng.choice((-1.0, 1.0), (40, 50)) if table == "change" else 1)
+        )
+        values[0, :5], values[1] = 1e3 * size, np.nan  # corners, and solid
+        scale = scale_of(values, table)
+        known = np.abs(values[np.isfinite(values)])
+        assert (known > scale.high).mean() < 0.01 and scale.low == (-scale.high if table == "change" else 0.0)
+        assert scale.high < 1.7 * np.quantile(known, 0.995), "the colours are of what is there"
