@@ -133,7 +133,10 @@ def test_a_camera_that_shows_the_chip_in_another_orientation_is_a_failure_with_t
     assert levels(with_sets(config, sets), tmp_path)["axes"] == OK
 
 
-@pytest.mark.parametrize(("speed", "level"), [(1e9, OK), (5e6, WARNING), (1e6, FAILURE)])
+# A run of that rate needs 3.64 MB/s.
+@pytest.mark.parametrize(
+    ("speed", "level"), [(1e9, OK), (7.3e6, OK), (7.2e6, WARNING), (3.7e6, WARNING), (3.6e6, FAILURE)]
+)
 def test_a_disk_is_judged_by_what_the_camera_delivers(
     speed: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
