@@ -16,8 +16,8 @@ import zstandard
 from flowrec.core import MovieError
 from flowrec.movies import MovieNotes, ReadOptions, ome, open_movie
 from flowrec.movies.notes import notes_in
-from flowrec.rigs import MovieRig, MovieSource
-from flowrec.stages import Coils
+from flowrec.rigs import MovieRig, MovieSource, fitted_to_movie
+from flowrec.stages import Coils, load_config
 from flowrec.stages.config import MovieSettings
 from tests.extras import needs
 from tests.movies import makers
@@ -303,6 +303,21 @@ def test_of_a_movie_that_is_played_for_a_time_the_image_at_its_end_is_the_last(t
         source = MovieSource(MovieSettings(path=str(folder), rate_hz=10.0), Coils())
         with MovieRig(source, 0.0, duration_s) as rig:
             assert len(list(rig.inputs())) == rig.taken == rig.images == count
+
+
+def test_the_top_speed_of_a_robot_in_a_movie_is_that_of_the_fastest_rotation_that_had_a_field(tmp_path):
+    makers.folder(tmp_path / "pngs", pictures(count=4))
+    rows = ["time_s,frequency_hz,heading_deg,amplitude_mt", "0,50,0,0", "0.1,4,0,3", "0.2,3,0,3", "0.3,50,0,0"]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    sets = [
+        "camera.um_per_px=2",
+        "robot.radius_um=25",
+        "robot.um_per_rev=30",
+        "chip.path=sessions/chips/y_junction.png",
+    ]
+    files = [f"movie.path={tmp_path / 'pngs'}", f"movie.coils={tmp_path / 'log.csv'}", "movie.rate_hz=10"]
+    fitted, _, _ = fitted_to_movie(load_config(None, [*sets, *files]))
+    assert fitted.robot.max_speed_um_s == pytest.approx(1.2 * 4.0 * 30.0)
 
 
 def test_samples_of_more_bits_than_an_image_can_have_are_refused(tmp_path):

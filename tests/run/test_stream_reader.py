@@ -305,6 +305,7 @@ def test_values_of_a_program_are_a_stream_with_a_channel_a_name() -> None:
         assert states.units == "Pa\ndeg"  # type: ignore[attr-defined]
         assert sorted(samples.value.tolist()) == list(range(20))  # type: ignore[attr-defined]
         assert set(samples.channel.tolist()) == {1}  # type: ignore[attr-defined]
+        assert samples.latest.tolist() == [1.0, samples.value[-1]]  # type: ignore[attr-defined]
         with pytest.raises(UsageError, match="of one line"):
             run.log("two\nlines", 0, 1.0)
 

@@ -13,8 +13,8 @@ import pytest
 
 import flowrec
 from flowrec.core import UsageError
-from flowrec.physics import FlowSolver, chip_files
-from flowrec.stages import Config, FieldLog, load_config, to_toml
+from flowrec.physics import ORIENTATIONS, FlowSolver, chip_files
+from flowrec.stages import Config, FieldLog, MovieSettings, load_config, to_toml
 from flowrec.verbs import first_pass, misfit
 from flowrec.verbs.first_pass import MovieTracks, radius_in_image
 from flowrec.verbs.misfit import trembling as trembling_um
@@ -224,3 +224,22 @@ def test_a_track_is_compared_with_what_the_log_drove_its_delay_before(monkeypatc
     config = SimpleNamespace(robot=SimpleNamespace(delay_s=0.07, um_per_rev=30.0, radius_um=1.0))
     misfit.motion_by_log(seen, config)  # type: ignore[arg-type]
     np.testing.assert_allclose(compared, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("offset_deg", "mirrored"), [(0.0, False), (25.0, False), (-140.0, True)])
+def test_the_settings_for_a_log_in_other_axes_turn_its_headings_to_where_the_robot_moves(
+    offset_deg: float, mirrored: bool
+) -> None:
+    logged_rad = np.radians([0.0, 20.0, 130.0, -75.0])
+
+    def directions(offset_deg: float, mirrored: bool) -> np.ndarray:
+        heading_rad = np.radians(offset_deg) + (-logged_rad if mirrored else logged_rad)
+        return np.stack([np.cos(heading_rad), np.sin(heading_rad)])
+
+    for orientation in ORIENTATIONS:
+        stated = MovieSettings(heading_offset_deg=offset_deg, heading_mirrored=mirrored)
+        text = misfit._log_settings(orientation, stated)
+        settings = load_config(None, [each.replace(" ", "") for each in text.split(", ")]).movie
+        assert -180.0 < settings.heading_offset_deg <= 180.0
+        found = directions(settings.heading_offset_deg, settings.heading_mirrored)
+        np.testing.assert_allclose(found, orientation.matrix @ directions(offset_deg, mirrored), atol=1e-9)

@@ -228,7 +228,7 @@ def test_a_board_whose_counters_overflow_has_turned_as_far_in_the_middle_of_each
     for number in range(400):
         at_ns, began_ns = 10**9 + number * 10**7, 10**9  # the board answers in the middle
         turned = hz * 1e-9 * (at_ns - began_ns) * np.array([math.cos(heading_rad), math.sin(heading_rad)])
-        offset = np.array([10**6, -(10**6)])
+        offset = np.array([4 * 10**6, -9 * 10**6])
         x, y = np.rint(1e6 * turned + offset).astype(int).tolist()  # both pass 0 on their way
         clock_us = (at_ns // 1000 + wrap - 3 * 10**6) % wrap
         answer = Telemetry(clock_us, hz, heading_rad, 4.0, (x % wrap, y % wrap), np.zeros(3))
