@@ -368,6 +368,8 @@ def test_a_series_of_several_ome_files_is_one_movie(tmp_path):
     (tmp_path / "part2.ome.tif").unlink()
     with pytest.raises(MovieError, match=str(tmp_path)):
         read(tmp_path / "part0.ome.tif")
+    facts, frames, _ = read(tmp_path / "part0.ome.tif", partial=True)
+    assert facts.frames == len(facts.times_ns) == len(frames) == 8
 
 
 def test_what_can_not_be_kept_exactly_is_refused(tmp_path):

@@ -186,6 +186,18 @@ def test_the_ring_takes_no_more_memory_than_it_may_and_says_what_it_holds(tmp_pa
     assert "of 8 s fit into 4 MB; set recording.snapshot_mb" in remark
 
 
+def test_only_a_snapshot_that_lacks_what_did_not_fit_into_memory_says_so(tmp_path):
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, (256, 256), dtype=np.uint8) for _ in range(8)]  # 65 kB that do not pack, ...
+    black = np.zeros((256, 256), np.uint8)  # ... and nothing that does
+    options = WriterOptions(files=Snapshot(2.0, 0.5, megabytes=3.0), block=True, queue_limit_bytes=1 << 20)
+    with SessionWriter(tmp_path / "x.mcap", HEADER, options) as writer:
+        for n, tick in enumerate(with_events((200, ("mark", "")), (500, ("mark", "")))):
+            writer.write(replace(tick, frame=Frame(tick.stamp_ns, n, noise[n % 8] if n < 240 else black)))
+    short = ["short_of_memory" in span_of(file)[2]["flowrec.outcome"] for file in writer.files]
+    assert short == [True, False]
+
+
 def test_a_place_that_may_not_be_written_or_is_taken_is_told_before_the_run(tmp_path):
     with pytest.raises(SessionError, match="no such directory"):
         SessionWriter(tmp_path / "missing" / "x.mcap", HEADER, WriterOptions(files=ABOUT))

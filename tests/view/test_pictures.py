@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 import rerun as rr
 
 from flowrec.console.page_state import SHOWN, PageState
-from flowrec.core import Applied, FlowField, Measured, Outcome, Shift, Tick
+from flowrec.core import Applied, CameraLosses, Drops, FlowField, Measured, Outcome, Shift, Tick
 from flowrec.physics import Calibration, sample
 from flowrec.stages import figures_of
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
@@ -29,8 +30,9 @@ from flowrec.view import (
     scale_of,
 )
 from flowrec.view.drawing import encode_jpeg
-from flowrec.view.entities import TIME_TO_GO
+from flowrec.view.entities import LOSSES, TIME_TO_GO
 from flowrec.view.logger import TickLogger
+from flowrec.view.state_lanes import StateLogger
 from flowrec.view.summary_text import LiveSummary
 
 
@@ -371,3 +373,21 @@ def test_a_scale_reaches_to_all_but_a_hundredth_of_a_map_and_not_far_beyond(tabl
         known = np.abs(values[np.isfinite(values)])
         assert (known > scale.high).mean() < 0.01 and scale.low == (-scale.high if table == "change" else 0.0)
         assert scale.high < 1.7 * np.quantile(known, 0.995), "the colours are of what is there"
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (Drops(1, "/camera/frame", 2, 0, 1), "2 lost"),
+        (Drops(1, "/camera/frame", 0, 3, 1), "3 lost"),
+        (Drops(1, "/camera/frame", 2, 3, 4), "5 lost, every 4. kept"),
+        (Drops(1, "/camera/frame", 0, 0, 1), None),
+        (CameraLosses(1, 967, 950, 2, 3, 5, 7, 0, 0), "17 lost before the loop"),
+        (CameraLosses(1, 967, 967, 0, 0, 0, 0, 0, 0), None),
+    ],
+)
+def test_the_lane_of_losses_counts_those_of_camera_and_disk(message: Any, said: str | None) -> None:
+    told: list[Any] = []
+    logger = StateLogger(SimpleNamespace(log=lambda *of, **_: told.append(of)), doubtful=False)  # type: ignore[arg-type]
+    logger.log(message)
+    assert logger._now == ({} if said is None else {LOSSES: said}) and bool(told) == (said is not None)
