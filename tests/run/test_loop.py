@@ -119,3 +119,18 @@ def test_what_an_operator_asks_waits_for_a_tick_that_has_no_event_of_its_own() -
         for stamp_ns, event in ((1, own), (2, None), (3, None))
     ]
     assert given[0] is own and given[1] is not None and given[1].action == Action.MARK and given[2] is None
+
+
+def test_a_run_whose_field_went_only_after_failures_says_so() -> None:
+    prepared = prepare(load_config(None, SMALL), aloud=False)
+    failures = iter([OSError("the driver is busy")] * 3)
+
+    class Rig(SimulatedRig):
+        def zero(self) -> None:
+            if (error := next(failures, None)) is not None:
+                raise error
+            super().zero()
+
+    pipeline = prepared.pipeline
+    report = run(pipeline, Rig.of(pipeline, prepared.config, 0.2), LockstepWorker(pipeline, 0.1), [])
+    assert report.note.endswith("the coils' zero() worked after 3 failures")

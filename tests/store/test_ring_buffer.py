@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from flowrec.store import FRAME_PATH, SessionReader, SessionWriter, WriterOption
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.run_files import snapshot_path
-from flowrec.store.session_file import SessionFile, Snapshot
+from flowrec.store.session_file import SessionFile, Snapshot, Split
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of, write_session
 from tests.store.test_damage import names_in
 from tests.store.test_durability import slow_disk
@@ -269,3 +270,19 @@ def test_nothing_is_written_behind_what_the_disk_has_refused(tmp_path, monkeypat
     assert len(written) == 1
     with pytest.raises(SessionError, match="the disk is full"):
         file.check()
+
+
+@pytest.mark.parametrize("files", [Split(seconds=0.6), Snapshot(0.8, 0.4)])
+def test_no_number_of_a_message_is_missing_or_twice_between_a_keyframe_and_what_follows_it(files, tmp_path):
+    with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=files, block=True)) as writer:
+        for tick in islice(with_events((100, ("mark", "")), (250, ("mark", ""))), 300):
+            writer.write(tick)
+    assert len(writer.files) > 1
+    for piece in writer.files:
+        found = {}
+        with piece.open("rb") as stream:
+            for _, channel, message in make_reader(stream).iter_messages():
+                if channel.metadata.get("role") not in (None, "view") and channel.topic != "/camera/frame":
+                    found.setdefault(channel.topic, []).append(message.sequence)
+        for topic, numbers in found.items():
+            assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), (piece.name, topic)

@@ -27,7 +27,7 @@ from flowrec.store import (
     session_header,
     session_sha256,
 )
-from flowrec.store.run_files import partial_path, parts, run_files, snapshot_path
+from flowrec.store.run_files import Run, RunFile, partial_path, parts, run_files, snapshot_path
 from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.check import check
@@ -345,3 +345,13 @@ def test_parts_are_in_order_of_their_number_and_nothing_else_is_among_them(tmp_p
         path.touch()
     assert parts(run) == [part_path(run, number) for number in sorted(numbers)]
     assert set(run_files(run)) == {part_path(run, number) for number in numbers} | set(others[:2])
+
+
+def test_of_the_counts_of_parts_there_is_the_sum_and_of_what_is_told_of_the_last_alone_nothing():
+    told = {"outcome": "continued", "ticks": "7", "dropped_frames": "2", "frames_windows": "5 of 7 images"}
+    last = told | {"outcome": "reached", "ticks": "11", "note": "at the goal", "frames_missing_from_camera": "3"}
+    names = [part_path(Path("x.mcap"), number) for number in (1, 2)]
+    files = [RunFile(name, None, 0, 1, {}, outcome, 0, None) for name, outcome in zip(names, (told, last), strict=True)]
+    both = {"outcome": "reached", "ticks": "18", "dropped_frames": "4", "note": "at the goal"}
+    assert Run(Path("x.mcap"), files).outcome == both | {"frames_missing_from_camera": "3"}
+    assert Run(names[1], files[1:]).outcome == last

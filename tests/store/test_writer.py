@@ -400,3 +400,13 @@ def test_the_queue_holds_4_s_of_images_within_bounds_and_the_head_promises_no_le
         told = session_writer._durability(config, live=live)
         assert float(told["durability_images_s"]) == pytest.approx(lost_s, rel=0.006)
         assert told["durability_state_s"] == "0.5"
+
+
+def test_an_image_without_the_rest_of_its_tick_is_no_tick_of_the_count(tmp_path):
+    whole, alone, other = TICKS[:3]
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
+        writer.write(whole)
+        writer.write(replace(whole, stamp_ns=alone.stamp_ns, frame=alone.frame))
+        writer.write(other)
+        assert writer.ticks == 2
+    assert SessionReader(writer.path).outcome["ticks"] == "2"
