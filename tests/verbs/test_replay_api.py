@@ -6,6 +6,7 @@ import gc
 import json
 import math
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,9 +14,10 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import TOPICS, FlowField, Observations, Tick, UsageError
+from flowrec.core import NS_PER_S, TOPICS, Estimate, FlowField, Observations, Tick, UsageError
+from flowrec.exports.report.history import History
 from flowrec.run import before_after
-from flowrec.run.replay_figures import CommandDifference
+from flowrec.run.replay_figures import CommandDifference, _residual_um_s
 from flowrec.verbs.replay_result import BeforeAfter
 from tests.conftest import HANG_S, invoke
 from tests.extras import why
@@ -145,3 +147,20 @@ def test_what_each_map_leaves_of_the_flow_is_told_by_the_observations_of_the_rep
     told = {key: (was, now) for key, was, now in before_after(done)}  # type: ignore[arg-type]
     # Lengths of the misses: 3 and the root of 73 um/s on the recorded map, twice 4 on the other.
     assert told["residual_um_s"] == (pytest.approx(math.sqrt((9.0 + 73.0) / 2.0)), pytest.approx(4.0))
+
+
+def test_a_map_that_has_found_another_registration_is_compared_where_the_image_shows_its_places() -> None:
+    columns = np.broadcast_to(np.arange(9.0)[None, :, None], (8, 9, 2)).astype(np.float32)  # um/s, a pixel 1 more
+    field = FlowField(0, 0, "known", 20.0, columns, np.zeros((8, 9)), None, np.zeros(1), 1.0, 1000.0, "")
+    field = replace(field, registration=np.array([[1.0, 0.0, 40.0], [0.0, 1.0, 0.0]]))  # two pixels to the right
+    seen = Observations(0, np.array([[60.0, 60.0], [80.0, 80.0]]), np.array([[5.0, 5.0], [6.0, 6.0]]), np.ones(2))
+    assert _residual_um_s(field, seen) == pytest.approx(0.0, abs=1e-5)
+    history = History(0, NS_PER_S)
+    history.add(
+        Tick(
+            1,
+            estimate=Estimate(1, np.array([60.0, 60.0]), np.zeros(2), np.eye(4), 1.0, np.zeros(2), True),
+            refined=field,
+        )
+    )
+    assert history.curve("map_x_um_s").known == pytest.approx([5.0])
