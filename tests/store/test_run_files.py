@@ -7,11 +7,12 @@ from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowrec.core import BY_FIELD, SessionError, Tick
+from flowrec.core import BY_FIELD, Frame, SessionError, Tick
 from flowrec.physics import load_chip
 from flowrec.stages import load_config
 from flowrec.stages.resolve import resolve
@@ -28,6 +29,7 @@ from flowrec.store import (
     session_sha256,
 )
 from flowrec.store.run_files import Run, RunFile, partial_path, parts, run_files, snapshot_path
+from flowrec.store.session_file import Split
 from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.check import check
@@ -355,3 +357,17 @@ def test_of_the_counts_of_parts_there_is_the_sum_and_of_what_is_told_of_the_last
     both = {"outcome": "reached", "ticks": "18", "dropped_frames": "4", "note": "at the goal"}
     assert Run(Path("x.mcap"), files).outcome == both | {"frames_missing_from_camera": "3"}
     assert Run(names[1], files[1:]).outcome == last
+
+
+def test_a_run_of_deep_images_without_its_last_part_is_given_an_end(tmp_path):
+    deep = [
+        replace(tick, frame=Frame(tick.stamp_ns, number, tick.frame.image.astype(np.uint16) << 3, 12))
+        for number, tick in enumerate(ticks_of(60, shape=(16, 16)))
+    ]
+    write_session(tmp_path / "x.mcap", deep, files=Split(seconds=0.3), bits=12, outcome={"outcome": "reached"})
+    *kept, last = parts(tmp_path / "x.mcap")
+    last.unlink()
+    assert len(kept) > 1 and recover_run(tmp_path / "x.mcap")[-1].lost == f"everything after {kept[-1].name}"
+    whole = SessionReader(tmp_path / "x.mcap")
+    assert whole.frame_bits == 12 and whole.outcome["outcome"] == "cut"
+    assert all(same(one, other) for one, other in zip(whole.ticks(), deep, strict=False))

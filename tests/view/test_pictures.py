@@ -391,3 +391,13 @@ def test_the_lane_of_losses_counts_those_of_camera_and_disk(message: Any, said: 
     logger = StateLogger(SimpleNamespace(log=lambda *of, **_: told.append(of)), doubtful=False)  # type: ignore[arg-type]
     logger.log(message)
     assert logger._now == ({} if said is None else {LOSSES: said}) and bool(told) == (said is not None)
+
+
+@pytest.mark.parametrize("scale", [ColourScale("speed", 0.0, 8.0, 2.0), ColourScale("change", -8.0, 8.0, 4.0)])
+def test_the_colours_of_a_scale_go_from_its_low_end_to_its_high_end(scale: ColourScale) -> None:
+    table = scale.paint(np.linspace(scale.low, scale.high, 256))
+    assert len(np.unique(table, axis=0)) > 200
+    middle = 0.5 * (scale.low + scale.high)
+    found = scale.paint([scale.low - 9.0, scale.low, middle, scale.high, scale.high + 9.0, np.nan])
+    np.testing.assert_allclose(found[:5].astype(int), table[[0, 0, 128, 255, 255]].astype(int), atol=2)
+    assert tuple(found[5]) == colours.SOLID
