@@ -10,7 +10,7 @@ from typing import Protocol, TypeGuard
 import numpy as np
 
 from flowrec.core import Demand, FlowField, Observations, Route, Row, Tick, Value, finite, seconds
-from flowrec.physics import sample
+from flowrec.physics import sample_as_seen
 from flowrec.run.route_orders import no_observations
 from flowrec.stages import ResolvedConfig, flow_error, length_um, travel_time
 from flowrec.store import Session
@@ -155,7 +155,7 @@ def _residual_um_s(flow: FlowField | None, observations: Observations) -> float 
     """Root mean square of observed minus mapped flow, um/s, both components together."""
     if flow is None:
         return None
-    miss = observations.flow_um_s - sample(flow, observations.position_um)
+    miss = observations.flow_um_s - sample_as_seen(flow, observations.position_um)
     return finite(float(np.sqrt((miss**2).sum(axis=1).mean())))
 
 

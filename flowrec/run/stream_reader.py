@@ -238,7 +238,7 @@ class StreamReader:
             while sum(len(each.values) for each in self._queue) > most and len(self._queue) > 1:
                 lost += len(self._queue.popleft().values) // channels
             known = self._counts
-            self._set(samples=known.samples + count, lost=known.lost + lost, missing=max(known.missing + missing, 0))
+            self._set(samples=known.samples + count, lost=known.lost + lost, missing=known.missing + missing)
 
     def _without_steps(self, times_ns: Ints, arrival_ns: int) -> Ints:
         """Stamps without the steps of the sender's clock."""

@@ -55,7 +55,7 @@ def cut(
     SessionError : the session can not be read, or the output not be written; OutputError if it may not be.
     """
     from flowrec.core import MCAP, Output, UsageError, seconds
-    from flowrec.store import Session, cut_session, files_behind, run_files
+    from flowrec.store import Session, cut_session, files_behind
 
     if from_s is None and to_s is None:
         raise MisuseError("give the first second, or the last one with --to, or both", "--from")
@@ -69,6 +69,5 @@ def cut(
         raise UsageError(f"--from {seconds(begin_ns):g} --to {seconds(end_ns):g}: {why}")
     path = out if out is not None else opened.path.with_name(f"{opened.path.stem}_cut{MCAP[0]}")
     output = Output(path, MCAP, tuple(files_behind(opened.path)), overwrite)
-    output.check(run_files(path))
     count = cut_session(opened.reader, output, here[0], here[-1])
     return CutSession(path, count, seconds(here[0]), seconds(here[-1]))

@@ -20,7 +20,7 @@ from flowrec.console import RunEnded
 from flowrec.console import console as console_module
 from flowrec.console.board import MOST_PAGES
 from flowrec.console.page_state import PageState
-from flowrec.core import WALLS, Estimate, Extra, FlowField, RobotWalls, Tick, Track, UsageError
+from flowrec.core import WALLS, CameraLosses, Estimate, Extra, FlowField, RobotWalls, Tick, Timing, Track, UsageError
 from flowrec.run import COMMANDS
 from flowrec.stages.robot_topics import messages_of
 from flowrec.view import Batch, LiveView, Scene
@@ -262,3 +262,10 @@ def test_without_its_packages_the_console_is_refused_in_a_line(monkeypatch: pyte
     monkeypatch.setattr(console_module, "PACKAGES", ("no_such_package",))
     with pytest.raises(UsageError, match=r"pip install 'flowrec\[console\]'"):
         console_module.refuse_without_packages()
+
+
+def test_the_page_counts_the_images_that_are_lost_by_each_cause(scene: Scene) -> None:
+    state = PageState(scene)
+    told = {"stamp_ns": 1, "losses": CameraLosses(1, 967, 950, 2, 3, 5, 7, 0, 0)}
+    state.take(Batch(1, [told | {"timing": Timing(1, 1.1, 0.3, 0.5, 0.2, 4.7, 5.9, 11)}], {}))
+    assert set(state.state()["losses"]) == {"11 not written", "2 link", "3 incomplete", "5 driver", "7 too late"}

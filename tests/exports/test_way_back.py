@@ -96,7 +96,9 @@ def slow_robot(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("movie", ["tiff", "plain"])
-def test_robot_and_pose_of_the_camera_come_from_the_movie_or_from_the_tables_and_what_is_given_stays(movie, slow_robot):
+def test_robot_and_pose_of_the_camera_come_from_the_movie_or_from_the_tables_and_what_is_given_stays(
+    movie, slow_robot, tmp_path
+):
     rate = {} if movie == "tiff" else {"fps": 15.0}
     asked = asked_import(slow_robot[movie], coils=slow_robot["log"], **rate)
     assert (asked.robot.um_per_rev, asked.robot.delay_s, asked.camera.angle_deg) == (30.0, 0.08, 12.0)
@@ -105,6 +107,11 @@ def test_robot_and_pose_of_the_camera_come_from_the_movie_or_from_the_tables_and
     given = replace(usual, robot=replace(usual.robot, um_per_rev=28.0), camera=replace(usual.camera, angle_deg=10.0))
     asked = asked_import(slow_robot[movie], given, coils=slow_robot["log"], **rate)
     assert (asked.robot.um_per_rev, asked.robot.delay_s, asked.camera.angle_deg) == (28.0, 0.08, 10.0)
+    if movie == "plain":  # one that was cut is not the picture of which the tables speak
+        cut = tmp_path / "cut.tif"
+        tifffile.imwrite(cut, tifffile.imread(slow_robot["plain"])[:, :, 8:], metadata={"axes": "TYX"})
+        asked = asked_import(cut, coils=slow_robot["log"], **rate)
+        assert (asked.robot.um_per_rev, asked.camera) == (30.0, usual.camera)
     measured = replace(usual, camera=replace(usual.camera, registration="measured.toml"))
     assert asked_import(slow_robot[movie], measured, coils=slow_robot["log"], **rate).camera.angle_deg == 0.0
 

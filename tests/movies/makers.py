@@ -101,7 +101,7 @@ def folder(path: Path, images, name: str = "img_{}.png") -> Path:
     return path
 
 
-def nd2(path: Path, images, times_s, bits: int = 12, um_per_px: float = 0.65) -> Path:
+def nd2(path: Path, images, times_s, bits: int = 12, um_per_px: float = 0.65, compression: int = 2) -> Path:
     """A minimal ND2 file of version 3: chunks with attributes, planes, time loop, times and images, then their map."""
     height, width = images[0].shape
     step = images[0].dtype.itemsize
@@ -109,6 +109,7 @@ def nd2(path: Path, images, times_s, bits: int = 12, um_per_px: float = 0.65) ->
         "SLxImageAttributes",
         _uint("uiWidth", width), _uint("uiHeight", height), _uint("uiWidthBytes", width * step), _uint("uiComp", 1),
         _uint("uiBpcInMemory", 8 * step), _uint("uiBpcSignificant", bits), _uint("uiSequenceCount", len(images)),
+        _uint("eCompression", compression),
     )  # fmt: skip
     probe = _level("pFluorescentProbe", _bool("m_bIsUsed", False))  # without one the library fails
     plane = _level("a0", _uint("uiCompCount", 1), _uint("uiSampleIndex", 0), probe)

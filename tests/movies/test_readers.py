@@ -4,6 +4,7 @@ import json
 import struct
 import sys
 import zlib
+from dataclasses import fields, replace
 
 import av
 import cv2
@@ -13,9 +14,10 @@ import tifffile
 import zstandard
 
 from flowrec.core import MovieError
-from flowrec.movies import ReadOptions, ome, open_movie
-from flowrec.rigs import MovieRig, MovieSource
-from flowrec.stages import Coils
+from flowrec.movies import MovieNotes, ReadOptions, ome, open_movie
+from flowrec.movies.notes import notes_in
+from flowrec.rigs import MovieRig, MovieSource, fitted_to_movie
+from flowrec.stages import Coils, load_config
 from flowrec.stages.config import MovieSettings
 from tests.extras import needs
 from tests.movies import makers
@@ -295,6 +297,29 @@ def test_the_early_end_of_a_movie_is_what_its_rig_noticed_while_it_played(tmp_pa
         assert len(rig.noticed) == 1 and "first 5 images" in rig.noticed[0]
 
 
+def test_of_a_movie_that_is_played_for_a_time_the_image_at_its_end_is_the_last(tmp_path):
+    folder = makers.folder(tmp_path / "pngs", pictures(count=4))
+    for duration_s, count in ((None, 4), (0.2, 3), (0.19, 2), (0.0, 1)):
+        source = MovieSource(MovieSettings(path=str(folder), rate_hz=10.0), Coils())
+        with MovieRig(source, 0.0, duration_s) as rig:
+            assert len(list(rig.inputs())) == rig.taken == rig.images == count
+
+
+def test_the_top_speed_of_a_robot_in_a_movie_is_that_of_the_fastest_rotation_that_had_a_field(tmp_path):
+    makers.folder(tmp_path / "pngs", pictures(count=4))
+    rows = ["time_s,frequency_hz,heading_deg,amplitude_mt", "0,50,0,0", "0.1,4,0,3", "0.2,3,0,3", "0.3,50,0,0"]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    sets = [
+        "camera.um_per_px=2",
+        "robot.radius_um=25",
+        "robot.um_per_rev=30",
+        "chip.path=sessions/chips/y_junction.png",
+    ]
+    files = [f"movie.path={tmp_path / 'pngs'}", f"movie.coils={tmp_path / 'log.csv'}", "movie.rate_hz=10"]
+    fitted, _, _ = fitted_to_movie(load_config(None, [*sets, *files]))
+    assert fitted.robot.max_speed_um_s == pytest.approx(1.2 * 4.0 * 30.0)
+
+
 def test_samples_of_more_bits_than_an_image_can_have_are_refused(tmp_path):
     path = makers.folder(tmp_path / "pngs", pictures())
     with open_movie(path) as movie, pytest.raises(MovieError, match=r"32 bits.*ffm"):
@@ -343,6 +368,8 @@ def test_a_series_of_several_ome_files_is_one_movie(tmp_path):
     (tmp_path / "part2.ome.tif").unlink()
     with pytest.raises(MovieError, match=str(tmp_path)):
         read(tmp_path / "part0.ome.tif")
+    facts, frames, _ = read(tmp_path / "part0.ome.tif", partial=True)
+    assert facts.frames == len(facts.times_ns) == len(frames) == 8
 
 
 def test_what_can_not_be_kept_exactly_is_refused(tmp_path):
@@ -377,3 +404,32 @@ def test_a_zarr_whose_chunks_hold_nothing_or_unpack_without_measure_is_refused(t
         chunk.write_bytes(packed)
     with pytest.raises(MovieError, match=r"bomb\.zarr: .*3\.2 GB"):
         read(bomb)
+
+
+@needs("nd2")
+@pytest.mark.parametrize(("compression", "lossy"), [(0, False), (1, True), (2, False)])  # as ND2 numbers them
+def test_a_nikon_file_says_whether_its_levels_were_changed(compression, lossy, tmp_path):
+    path = makers.nd2(tmp_path / "a.nd2", pictures(12), np.arange(COUNT) / 30, compression=compression)
+    with open_movie(path) as movie:
+        assert movie.facts.lossy is lossy
+
+
+def test_the_time_of_an_image_of_several_planes_is_that_of_the_first():
+    times_s = [[0.0, 0.3, 0.5], [1.0, 1.3, 1.5]]
+    planes = "".join(
+        f'<Plane TheC="{c}" TheZ="0" TheT="{t}" DeltaT="{time_s}"/>'
+        for t, of_image in enumerate(times_s)
+        for c, time_s in enumerate(of_image)
+    )
+    facts = ome.ome_facts(ome.parse_ome(f"<OME><Pixels>{planes}</Pixels></OME>"), 2)
+    assert facts.times_s.tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("um_per_px", [0, -2.0, float("nan"), float("inf"), 1e9, None, "2"])
+def test_a_scale_that_no_pixel_can_have_is_damage_of_the_notes(um_per_px):
+    given = dict.fromkeys((each.name for each in fields(MovieNotes) if each.type == "str"), "")
+    given |= {each.name: 8 for each in fields(MovieNotes) if each.type == "int"} | {"drawn": False}
+    notes = MovieNotes(**given, um_per_px=2.0)
+    assert notes_in(notes.text(), makers.Path("a.mp4")) == notes
+    with pytest.raises(MovieError, match="um_per_px is"):
+        notes_in(replace(notes, um_per_px=um_per_px).text(), makers.Path("a.mp4"))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
+from dataclasses import fields
 from types import SimpleNamespace
 from typing import cast
 
@@ -12,7 +14,9 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from flowrec.core import NS_PER_S, Clocks, Tick
 from flowrec.exports import MapFigure, MotionFigure, PathFigure, PathFlowFigure, ReportData, style
+from flowrec.exports.report.history import History
 from flowrec.exports.report.map_figure import _panels
 from flowrec.exports.report.path_figure import scale_bar
 from flowrec.exports.report.report_data import picture_of
@@ -79,6 +83,44 @@ def test_the_curves_of_motion_are_what_their_labels_say(data: ReportData) -> Non
     assert figure.axes[-1].get_xlabel() == "session time (s)"
 
 
+HISTORY = {
+    "speed_um_s": p.SPEED_UM_S,
+    "demand_um_s": p.DEMAND_SPEED_UM_S,
+    "error_um": p.ERROR_UM,
+    "estimate_error_um": 5.0,
+    "flow_x_um_s": p.FLOW_UM_S[0],
+    "flow_y_um_s": p.FLOW_UM_S[1],
+    "flow_std_um_s": math.sqrt((2.25 + 2.89) / 2.0),
+    "true_x_um_s": p.TRUE_UM_S[0],
+    "true_y_um_s": p.TRUE_UM_S[1],
+    "nis": p.HEALTH_NIS,
+    "tick_ms": 4.7,
+    "queue_mb": 5.9,
+    "dropped": 0.0,
+    "lost": 2.0 + 3.0 + 5.0 + 7.0,  # by link, as incomplete, by the driver, by the queue
+}
+
+
+def test_a_curve_of_the_history_has_the_values_of_the_messages_by_which_it_is_called(data: ReportData) -> None:
+    for name, value in HISTORY.items():
+        np.testing.assert_allclose(data.history.curve(name).known, value, rtol=1e-6, err_msg=name)
+    for name, axis in (("x_um", 0), ("y_um", 1)):
+        curve = data.history.curve(name)
+        way = p.START_UM[axis] + p.VELOCITY_UM_S[axis] * (curve.time_s - 3.0)
+        np.testing.assert_allclose(curve.mean, way, rtol=1e-6, err_msg=name)
+
+
+def test_the_curves_of_the_delay_of_images_are_its_mean_and_its_largest_in_ms() -> None:
+    history = History(0, NS_PER_S)
+    for number in range(1, 5):
+        stamp_ns = number * NS_PER_S // 5
+        told = dict.fromkeys((each.name for each in fields(Clocks)), 0)
+        told |= {"stamp_ns": stamp_ns, "rate": 1.0, "late_s": 0.003, "latest_s": 0.011}
+        history.add(Tick(stamp_ns, clocks=Clocks(**told)))
+    for name, value_ms in (("late_ms", 3.0), ("latest_ms", 11.0)):
+        np.testing.assert_allclose(history.curve(name).known, value_ms, err_msg=name)
+
+
 def test_the_flow_at_the_places_of_the_robot_is_that_of_each_map(data: ReportData) -> None:
     found = lines_of(PathFlowFigure().draw(data, WIDE_MM))
     place_px = p.position_um(10) / p.UM_PER_PX
@@ -114,6 +156,13 @@ def test_the_maps_have_the_speed_of_each_pixel_in_um_per_second(data: ReportData
         assert np.isnan(shown.get_array().filled(np.nan)[~fluid]).all()
     (low, high) = maps[change].images[0].get_clim()
     assert low == -high < 0.0
+
+
+def test_the_one_scale_of_all_maps_of_speed_reaches_to_the_fastest_of_them(data: ReportData) -> None:
+    fastest = max(
+        float(np.hypot(*field.velocity_um_s.T).max()) for field in (data.assumed, data.refined, data.truth) if field
+    )
+    assert fastest > p.TRUE_SPEED_UM_S and fastest <= data.speed_scale().high < 1.7 * fastest
 
 
 def test_the_part_of_the_map_that_is_not_known_is_hatched_and_no_other(data: ReportData) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tifffile
+import zarr
 
 import flowrec
-from flowrec.core import SessionError
-from flowrec.exports.camera_images import image_stamps
+from flowrec.core import Frame, SessionError
+from flowrec.exports.camera_images import GreyScale, image_stamps
 from flowrec.movies import open_movie
 from flowrec.store import Session
 from tests.movies import makers
@@ -92,3 +94,27 @@ def test_an_ome_zarr_states_its_scale_in_micrometres_and_seconds(tmp_path: Path)
     with open_movie(path) as movie:
         assert movie.facts.um_per_px == 2.5
         np.testing.assert_allclose(np.diff(1e-9 * movie.facts.times_ns), 0.07)
+
+
+def test_the_scale_of_grey_levels_is_that_of_what_was_recorded_where_the_rest_is_black() -> None:
+    rng = np.random.default_rng(2)
+    window = np.zeros((60, 80), np.uint16)
+    window[20:40, 30:60] = rng.integers(900, 1301, (20, 30))
+    frame = Frame(0, 0, window, 12)
+    session = SimpleNamespace(
+        run=SimpleNamespace(first_ns=0, last_ns=10**9), at=lambda _s: SimpleNamespace(frame=frame)
+    )
+    grey = GreyScale.of(session, frame)  # type: ignore[arg-type]
+    assert 900 <= grey.low < 905 and 1295 < grey.high <= 1300
+    assert grey(window)[0, 0] == 0 and np.ptp(grey(window)[20:40, 30:60]) == 255
+
+
+def test_an_ome_zarr_whose_levels_are_scaled_together_has_the_product_of_both_scales_along_x(tmp_path: Path) -> None:
+    path = makers.ome_zarr(tmp_path / "a.zarr", [np.ones((48, 64), np.uint8)] * 3, 0.07, axes="tyx")
+    group = zarr.open_group(path, mode="r+")
+    ome = dict(group.attrs["ome"])
+    ome["multiscales"][0]["coordinateTransformations"] = [{"type": "scale", "scale": [10.0, 3.0, 2.0]}]
+    group.attrs["ome"] = ome
+    with open_movie(path) as movie:
+        assert movie.facts.um_per_px == 5.0
+        np.testing.assert_allclose(np.diff(1e-9 * movie.facts.times_ns), 0.7)

@@ -155,6 +155,19 @@ def test_a_persons_table_without_deviations_counts_each_at_a_twentieth_of_the_us
     np.testing.assert_allclose(observations_of(table).std_um_s, 2.5)
 
 
+@pytest.mark.parametrize(("fastest_um_s", "counts"), [(990.0, True), (1010.0, False)])
+def test_a_row_a_hundred_times_as_fast_as_most_says_nothing_of_the_deviation_of_the_others(
+    fastest_um_s: float, counts: bool
+) -> None:
+    from flowrec.store import observations_of
+
+    speeds = np.array([*[10.0] * 18, 0.0, fastest_um_s])  # most of the moving ones: 10 um/s
+    places = np.arange(20.0)
+    usual = np.sqrt((speeds[: 20 if counts else 19] ** 2).mean())
+    made = observations_of({"x_um": places, "y_um": places, "u_um_s": -0.6 * speeds, "v_um_s": 0.8 * speeds})
+    np.testing.assert_allclose(made.std_um_s, 0.05 * usual)
+
+
 def test_zarr_has_images_and_fields_with_axes_in_um(session: Session, exported: dict[str, Path]) -> None:
     import xarray
 

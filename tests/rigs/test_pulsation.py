@@ -8,7 +8,7 @@ import pytest
 from flowrec.core import FlowField
 from flowrec.physics import Robot
 from flowrec.rigs.simulated.bodies import Swimmer
-from flowrec.rigs.simulated.pump import Pump
+from flowrec.rigs.simulated.pump import Pump, PumpSensor
 from flowrec.stages import Simulated
 
 
@@ -38,3 +38,11 @@ def test_the_flow_of_a_drifting_pump_is_on_average_that_of_the_map_it_is_judged_
     strengths = [pump.strength(0.5 * step) for step in range(60)]
     assert np.std(strengths) > 0.02
     assert pump.mean_drift(30.0) == pytest.approx(np.mean(strengths), abs=1e-12)
+
+
+def test_a_sensor_at_the_pump_shows_a_step_its_delay_after_it() -> None:
+    pump = Pump(0.0, 0.0, 0.0, 0.0, 1.0, np.random.default_rng(0), step_share=0.5, step_s=2.0)
+    sensor = PumpSensor(pump, 100.0, 0.0, 0.3, 0, lambda: 5 * 10**9)
+    chunk = sensor.read(0.0)
+    assert chunk is not None and len(chunk.times_ns) == 501
+    assert chunk.times_ns[chunk.values[:, 0] < 0.75][0] == pytest.approx(2.3e9, abs=1.1e7)

@@ -39,7 +39,7 @@ class Device(TerminalTwin):
 
     def answer(self, line: str) -> None:
         if line.endswith("?"):
-            self.send(f"{line[:-1]} {self.state[line[:-1]]:.3e} V\r\n")
+            self.send(f"{line[:-1]} {self.state[line[:-1]]:.3e} V\r\nREADY 9\r\n")  # of which nobody takes the second
         else:
             name, value = line.split()
             self.state[name] = min(float(value), 3.0 if name == "VOLT" else 1e9)
@@ -124,6 +124,8 @@ def test_a_value_beyond_its_limits_an_unknown_output_and_one_without_a_run_are_r
     with pytest.raises(UsageError, match="no run"):
         log.set("generator/volt", 1.0)
     assert control.next_event(1, held=False) is None  # nothing is noted of what was not done
+    control.stop("enough")
+    assert obey(control, {"command": "output", "name": "generator/volt", "value": 4.5}) == "the run ends: enough"
 
 
 @pytest.mark.parametrize("settings", [{}, {"rest": []}, {"ask": ["VOLT?", "FREQ?"]}])

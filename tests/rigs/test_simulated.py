@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.core import ChipError, Currents, FlowField, RigError, UsageError
+from flowrec.core import Applied, ChipError, Currents, FlowField, RigError, UsageError
 from flowrec.physics import Calibration, ChipSettings, FlowSolver, Robot, load_chip
-from flowrec.rigs import SimulatedRig
+from flowrec.rigs import SimulatedRig, increasing_stamps
 from flowrec.rigs.simulated.world import true_chip
-from flowrec.stages import Coils, ResolvedCamera, Simulated, SimulatedImage
+from flowrec.stages import Coils, Inputs, ResolvedCamera, Simulated, SimulatedImage
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
 EXACT = Simulated(
@@ -292,3 +292,22 @@ def test_a_held_robot_stays_at_its_start_for_that_time_and_until_the_field_is_up
     assert soon[-1] - 1000.0 == pytest.approx(1.5 * (100.0 + 25.0), rel=0.05), "then it swims and drifts"
     late = at(commands={k: command(1.0, amplitude_mt=0.1 * k) for k in range(41)})
     assert 0.0 < let_go_s(late) - 41 / CAMERA.rate_hz < 0.4, "soon after it rises no more"
+
+
+def test_of_frames_whose_stamps_go_back_no_turn_is_lost_and_the_latest_message_of_each_topic_comes_with_the_next():
+    stamps_ns = [10, 20, 5, 20, 30, 29, 31]
+    sent = [
+        Inputs(
+            stamp_ns,
+            None,
+            Applied(stamp_ns, 1.0, 0.0, 1.0, np.zeros(3), np.array([1.0, -(2.0**number)])),
+            extra={"/every": number, f"/own/{number}": number},
+        )
+        for number, stamp_ns in enumerate(stamps_ns)
+    ]
+    rejected = []
+    taken = list(increasing_stamps(iter(sent), 0, lambda: rejected.append(1)))
+    assert [each.stamp_ns for each in taken] == [10, 20, 30, 31] and len(rejected) == 3
+    np.testing.assert_array_equal(sum(each.applied.turns for each in taken), sum(each.applied.turns for each in sent))
+    assert [each.extra["/every"] for each in taken] == [0, 1, 4, 6]
+    assert {f"/own/{number}" for number in (2, 3, 4)} <= taken[2].extra.keys()

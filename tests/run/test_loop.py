@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core import NS_PER_S, Estimate, NotFiniteError, Tick
+from flowrec.core import NS_PER_S, Action, Applied, Estimate, NotFiniteError, OperatorEvent, Tick
 from flowrec.rigs import SimulatedRig
-from flowrec.run import LockstepWorker, run
-from flowrec.stages import Observer, assemble, load_config
+from flowrec.run import LockstepWorker, RunControl, run
+from flowrec.run.loop import _with_events
+from flowrec.stages import Inputs, Observer, assemble, load_config
 from flowrec.store import SessionReader
 from flowrec.verbs import prepare
 from flowrec.verbs.record import record
@@ -106,3 +107,30 @@ def test_a_stage_that_fails_loses_the_field_before_anything_is_written_however_l
     with pytest.raises(ValueError, match="the observer is broken"):
         run(pipeline, Rig.of(pipeline, prepared.config, 1.0), LockstepWorker(pipeline, 0.1), [Hanging()])
     assert seen == [True]
+
+
+def test_what_an_operator_asks_waits_for_a_tick_that_has_no_event_of_its_own() -> None:
+    control, worker = RunControl(), LockstepWorker(prepare(load_config(None, SMALL), aloud=False).pipeline, 0.1)
+    assert control.mark()
+    own = OperatorEvent(1, Action.END, "the frames have ended")
+    nothing = Applied(1, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+    given = [
+        _with_events(Inputs(stamp_ns, None, nothing, operator=event), worker, control, Tick(), live=True).operator
+        for stamp_ns, event in ((1, own), (2, None), (3, None))
+    ]
+    assert given[0] is own and given[1] is not None and given[1].action == Action.MARK and given[2] is None
+
+
+def test_a_run_whose_field_went_only_after_failures_says_so() -> None:
+    prepared = prepare(load_config(None, SMALL), aloud=False)
+    failures = iter([OSError("the driver is busy")] * 3)
+
+    class Rig(SimulatedRig):
+        def zero(self) -> None:
+            if (error := next(failures, None)) is not None:
+                raise error
+            super().zero()
+
+    pipeline = prepared.pipeline
+    report = run(pipeline, Rig.of(pipeline, prepared.config, 0.2), LockstepWorker(pipeline, 0.1), [])
+    assert report.note.endswith("the coils' zero() worked after 3 failures")

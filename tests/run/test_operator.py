@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from flowrec.stages import load_config
 from flowrec.store import SessionReader
 from flowrec.verbs import record as verb
 from flowrec.verbs import session_replay as again
-from flowrec.verbs.auto_recovery import recover_leftovers
+from flowrec.verbs.auto_recovery import leftovers, recover_leftovers
 from flowrec.verbs.interactive import Unattended
 from tests.conftest import HANG_S
 from tests.short_missions import SMALL
@@ -275,6 +276,15 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
     assert set(threading.enumerate()) <= threads
     assert set(Path("/dev/fd").iterdir()) <= files
     assert [path.name for path in tmp_path.iterdir()] == [left.name]
+
+
+def test_of_what_killed_runs_have_left_the_latest_comes_first(tmp_path: Path) -> None:
+    ages = {"b": 2, "a": 1, "c": 3}
+    for name, age in ages.items():
+        (tmp_path / f"{name}.mcap.partial").write_bytes(b"x")
+        os.utime(tmp_path / f"{name}.mcap.partial", (1e9 - age, 1e9 - age))
+    (tmp_path / "d.recovering.mcap.partial").write_bytes(b"x")
+    assert [path.name[0] for path in leftovers(tmp_path)] == ["a", "b", "c"]
 
 
 def test_remains_that_are_too_large_are_offered_and_left_alone(

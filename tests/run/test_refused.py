@@ -8,7 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.core import Demand, Estimate, FlowField, FlowrecError, Mission, NotFiniteError, Route, Tick, as_read
+from flowrec.core import (
+    Demand,
+    Estimate,
+    FlowField,
+    FlowrecError,
+    Mission,
+    NotFiniteError,
+    Observations,
+    Route,
+    Tick,
+    as_read,
+)
 from flowrec.physics import FlowSolver
 from flowrec.run import work
 from flowrec.stages import Pipeline, Planner, Refiner, SurveyPlanner, assemble, load_config
@@ -132,6 +143,23 @@ def test_of_an_order_with_a_number_that_is_none_the_result_is_refused(pipeline: 
         assert isinstance(route, Route) and known.route is not None
         assert route.refused.startswith("Demand at 0.000 s refused: NaN or infinity in progress_s")
         np.testing.assert_array_equal(route.arrival_s, known.route.arrival_s)
+
+
+def test_of_observations_the_finite_ones_count_and_the_others_refuse_nothing(pipeline: Pipeline, known: Tick) -> None:
+    given: list[Observations] = []
+
+    class Taking(Refiner):
+        """Notes what it is given."""
+
+        def refine(self, assumed, observations, *known) -> FlowField:  # type: ignore[no-untyped-def]
+            given.append(observations)
+            return assumed
+
+    with as_read():
+        flow_um_s = np.array([[10.0, 0.0], [np.nan, 0.0], [12.0, 0.0]])
+        made = Observations(5, np.full((3, 2), 100.0), flow_um_s, np.ones(3))
+    done = work(replace(pipeline, refiner=Taking()), ordered(replace(known, observations=made), "refine", "refine"))
+    assert len(given) == 1 and "NaN" not in done.refused
 
 
 def test_what_a_fit_has_lost_is_found_before_scipy_is_given_it() -> None:

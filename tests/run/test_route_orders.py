@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flowrec.core import Phase
+from flowrec.run import route_orders
 from flowrec.run.route_orders import route, survey_route
 from flowrec.stages import SurveyPlanner, no_route
 from flowrec.stages.estimation import Sampler
@@ -94,3 +95,37 @@ def test_a_pause_takes_nothing_from_the_time_of_a_survey():
         survey_route(pipeline, order, SimpleNamespace(**phase, **where))
     # Of 100 s the survey has used 70, or 10 if it was held for 60; 3 s of the way under way are still to come.
     assert given == [pytest.approx(27.0), pytest.approx(87.0)]
+
+
+def test_a_better_route_begins_where_the_robot_will_be_when_it_is_adopted(monkeypatch):
+    given = []
+
+    def better(planner, field, uncertainty, present, from_s, *others):
+        given.append((present, from_s))
+        return NOWHERE
+
+    monkeypatch.setattr(route_orders, "better_route", better)
+    pipeline = SimpleNamespace(
+        planner=None,
+        mission=SimpleNamespace(lead_s=2.0),
+        refiner=SimpleNamespace(uncertainty=lambda *_: None),
+        **{"robot": robot(600.0), "sampler": Sampler(), "hindsight": None, "solver": None, "chip": None},
+    )
+    order = SimpleNamespace(
+        extra={},
+        health=SimpleNamespace(limit_hz=None),
+        route="the present one",
+        demand=SimpleNamespace(progress_s=4.0),
+        **{"field": 1, "assumed": 1, "observations": None, "tracer_flow": None, "stamp_ns": 0},
+    )
+    goal_um = np.array([3.0, 5.0])
+    mission = {"phase": Phase.NAVIGATE, "former_goal_um": (), "goal_um": goal_um, "speed_limit_um_s": None}
+    np.testing.assert_array_equal(route(pipeline, order, SimpleNamespace(**mission)).goal_um, goal_um)
+    assert given == [("the present one", 6.0)]
+
+
+def test_a_survey_expects_the_noise_of_the_latest_observations():
+    pipeline = SimpleNamespace(sampler=Sampler(), robot=robot(600.0))
+    made = SimpleNamespace(std_um_s=np.array([50.0] * 30 + [3.0] * 20))
+    order = SimpleNamespace(estimate=SimpleNamespace(covariance=np.eye(4)), observations=made)
+    assert route_orders._sampling(pipeline, order).noise_um_s == 3.0

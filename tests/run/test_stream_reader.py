@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flowrec.core import HEARD, NS_PER_S, SAMPLES, SILENT, STREAMS, Action, Applied, RigError, Tick, UsageError
-from flowrec.rigs import Chunk, NoStreamError, RunLog, StreamHead
+from flowrec.rigs import Chunk, LogStream, NoStreamError, RunLog, StreamHead
 from flowrec.rigs.streams.stream import named_channels
 from flowrec.run import RunControl, StreamInputs
 from flowrec.run.stream_reader import StreamReader
@@ -305,8 +305,21 @@ def test_values_of_a_program_are_a_stream_with_a_channel_a_name() -> None:
         assert states.units == "Pa\ndeg"  # type: ignore[attr-defined]
         assert sorted(samples.value.tolist()) == list(range(20))  # type: ignore[attr-defined]
         assert set(samples.channel.tolist()) == {1}  # type: ignore[attr-defined]
+        assert samples.latest.tolist() == [1.0, samples.value[-1]]  # type: ignore[attr-defined]
         with pytest.raises(UsageError, match="of one line"):
             run.log("two\nlines", 0, 1.0)
+
+
+def test_a_value_from_before_a_run_is_of_that_run_and_of_no_later_one() -> None:
+    run, taken = RunLog(), []
+    run.log("pressure", 1, 5.0)
+    for _ in range(2):
+        stream = LogStream("Pa")
+        run.attach({"log": stream})
+        taken.append(stream.read(0.0))
+        run.attach({})
+    first, second = taken
+    assert first is not None and first.values.tolist() == [5.0] and second is None
 
 
 def test_a_sender_that_is_not_there_is_refused_unless_it_is_only_noted() -> None:

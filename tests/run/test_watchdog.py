@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -230,6 +233,20 @@ def test_a_stop_that_is_late_takes_the_field_away_after_0_8_s_and_leaves_the_loo
         assert control.must_interrupt
 
 
+def test_who_leaves_no_time_for_a_ramp_has_the_field_off_at_the_next_tick() -> None:
+    driver = Driver()
+    control = RunControl(driver.clock)
+    control.ticking = True
+    control.stop("enough")
+    driver.now_s += 0.01
+    for wait_s in (0.01, 5.0):  # also a second time, after which it is no less late
+        control.skip_ramp()
+        driver.now_s += wait_s
+        assert control._late_s() > RAMP_PATIENCE_S
+    told = control.next_event(1, held=False)
+    assert told is not None and told.action == Action.ZERO
+
+
 def test_a_late_zero_keeps_the_reason_of_the_guard() -> None:
     driver = Driver()
     control = RunControl(driver.clock)
@@ -250,6 +267,17 @@ def test_a_field_that_must_go_at_once_waits_behind_no_note_or_mark() -> None:
     control.stop("guard: no tick", zero=True)
     taken = [event.action for event in iter(lambda: control.next_event(0, held=False), None) if event is not None]
     assert taken == [Action.ZERO, Action.NOTE, Action.NOTE, Action.NOTE, Action.MARK]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no Ctrl-Z")
+@pytest.mark.parametrize("off", [True, False])
+def test_ctrl_z_stops_no_process_whose_field_is_not_off(off: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "kill", lambda *told: sent.append(told))
+    tripped: list[str] = []
+    coils = SimpleNamespace(trip=tripped.append, wait_off=lambda _timeout_s: off)
+    Signals(RunControl(), coils)._handle(signal.SIGTSTP)  # type: ignore[arg-type]
+    assert sent == [(os.getpid(), signal.SIGSTOP)] * off and len(tripped) == 1
 
 
 def test_whoever_insists_has_the_process_ended_after_3_s_where_the_main_thread_does_not_end_the_run() -> None:

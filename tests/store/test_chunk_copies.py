@@ -4,7 +4,9 @@ import os
 import struct
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
@@ -13,6 +15,7 @@ from flowrec.store import SLOTS, SessionReader, recover
 from flowrec.store.file_reader import FileReader
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, records_in
 from flowrec.store.mcap_reader import McapReader
+from flowrec.store.merged_chunks import _overlapping, in_time
 from flowrec.store.scan import scan
 from flowrec.store.session_file import SessionFile, Snapshot, Split
 from flowrec.store.session_metadata import DIGEST, OUTCOME
@@ -199,3 +202,21 @@ def test_what_reads_back_otherwise_than_it_was_written_is_no_session(files, tmp_
     with pytest.raises(SessionError, match=r"left as it was.*can not be read back"):
         recover(path)
     assert names_in(tmp_path) == ["s.mcap.partial"] and path.read_bytes() == before
+
+
+def test_chunks_that_share_a_time_are_sorted_together_in_file_order_and_the_others_are_not():
+    rng = np.random.default_rng(8)
+    for _ in range(200):
+        begins, lasts = rng.integers(0, 30, 6), rng.integers(0, 6, 6)
+        chunks = [
+            SimpleNamespace(message_start_time=a, message_end_time=a + b, chunk_start_offset=n, uncompressed_size=1)
+            for n, (a, b) in enumerate(zip(begins.tolist(), lasts.tolist(), strict=True))
+        ]
+        bundles = list(_overlapping(None, sorted(chunks, key=in_time)))
+        assert sorted(each.chunk_start_offset for bundle in bundles for each in bundle) == list(range(6))
+        for bundle in bundles:
+            places = [each.chunk_start_offset for each in bundle]
+            assert places == sorted(places)
+        ends = [max(each.message_end_time for each in bundle) for bundle in bundles]
+        starts = [min(each.message_start_time for each in bundle) for bundle in bundles]
+        assert all(end < start for end, start in zip(ends, starts[1:], strict=False))

@@ -72,6 +72,10 @@ def test_a_cut_replaces_nothing_and_needs_a_stretch_with_a_tick(session: Path, t
     with pytest.raises(OutputError, match="exists already"):
         cut(session, 1.0, None, there)
     assert there.read_bytes() == b"mine"
+    part = there.rename(tmp_path / "there.part001.mcap")
+    with pytest.raises(OutputError, match=r"there\.part001\.mcap: exists already"):
+        cut(session, 1.0, None, there)
+    part.rename(there)
     with pytest.raises(UsageError, match="give the first second"):
         cut(session, None, None, tmp_path / "b.mcap")
     stamps = np.array(flowrec.open(session).reader.stamps("applied")) / 1e9

@@ -178,6 +178,27 @@ def test_frames_that_the_camera_never_delivered_are_counted_apart(tmp_path):
     assert reader.outcome["frames_missing_from_camera"] == "2" and reader.outcome["dropped_frames"] == "0"
 
 
+@pytest.mark.parametrize("flush_s", [0.1, 0.5, 10.0])
+@pytest.mark.parametrize("sync_s", [0.2, 1.0, 30.0])
+def test_what_waits_for_a_flush_and_then_for_a_sync_is_no_older_than_was_promised(flush_s, sync_s):
+    options = WriterOptions(flush_s=flush_s, sync_s=sync_s)
+    assert options.flush_interval_s <= 0.5 * flush_s
+    assert options.flush_interval_s + options.sync_interval_s < sync_s, "and an fsync takes a while itself"
+
+
+def test_every_gap_of_the_camera_is_told_at_the_first_image_behind_it(tmp_path):
+    numbers = [0, 1, 3, 4, 7, 8, 9, 15]  # within a fifth of a second
+    with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
+        for number in numbers:
+            now = 10**9 + number * PERIOD_NS
+            writer.write(Tick(now, frame=Frame(now, number, np.zeros((4, 4), np.uint8))))
+    told = [
+        ((drops.stamp_ns - 10**9) // PERIOD_NS, drops.by_camera)
+        for drops in SessionReader(writer.path).messages("drops")
+    ]
+    assert told == [(3, 1), (7, 3), (15, 8)]
+
+
 def test_a_run_that_waits_for_its_disk_is_never_more_than_flush_s_ahead_of_it(tmp_path, monkeypatch):
     put = McapWriter._put
 

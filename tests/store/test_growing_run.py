@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from flowrec.core import SessionError
+from flowrec.core import NS_PER_S, SessionError
 from flowrec.store import GrowingRun, SessionReader, SessionWriter, WriterOptions, live_runs, recover
 from flowrec.store.session_file import Split
 from tests.conftest import HANG_S, until
@@ -65,6 +65,22 @@ def test_ticks_are_seen_while_the_run_goes_on_and_in_the_end_all_of_them_as_they
     writer.close()
     watcher.join(HANG_S)
     assert watcher.failure is None and same(watcher.ticks, SessionReader(path).ticks()) and len(watcher.ticks) == 90
+
+
+def test_a_tick_waits_for_its_image_but_no_longer_than_2_s_of_stamps(tmp_path):
+    path, (first, *later, last) = tmp_path / "x.mcap", TICKS[:6]
+    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
+        writer.write(first)
+        for tick in later:  # as if their images were still to be encoded
+            writer.write(replace(tick, frame=None))
+        writer._queue.wait_for_flush(later[-1].stamp_ns)
+        seen = GrowingRun(path)
+        assert [tick.stamp_ns for tick in seen._news()] == [first.stamp_ns]
+        late_ns = first.stamp_ns + 2 * NS_PER_S + 1
+        writer.write(replace(last, frame=None, stamp_ns=late_ns))  # the camera has stopped
+        writer._queue.wait_for_flush(late_ns)
+        seen._file.look()
+        assert [tick.stamp_ns for tick in seen._news()] == [*(tick.stamp_ns for tick in later), late_ns]
 
 
 @pytest.mark.slow("records a run in a process of its own")

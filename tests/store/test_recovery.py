@@ -141,6 +141,19 @@ def test_a_replay_takes_no_image_of_a_tick_that_it_passes_over_for_one_of_the_ne
     assert inputs[1].frame is None and inputs[1].track.same_as(blind.track)
 
 
+def test_a_replay_misses_the_images_that_were_lost_and_not_those_of_an_absent_camera(tmp_path):
+    seen, lost, absent = TICKS[:3]
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
+        writer.write(seen)
+        writer.write(replace(lost, frame=seen.frame))
+        applied = replace(absent.applied, absent_until_ns=absent.stamp_ns)
+        assert applied.without_image and not lost.applied.without_image
+        writer.write(replace(absent, frame=seen.frame, applied=applied))
+    with RecordedRig(SessionReader(tmp_path / "s.mcap")) as rig:
+        assert [each.frame is None for each in rig.inputs()] == [False, True, True]
+    assert rig.frames_missing == 1
+
+
 def test_topics_that_an_older_file_never_had_are_not_lost(tmp_path):
     golden = Path(__file__).parents[2] / "sessions" / "golden.mcap"
     done = recover(cut(golden, golden.stat().st_size // 2, tmp_path / "s.mcap.partial"))

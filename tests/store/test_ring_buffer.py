@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from flowrec.store import FRAME_PATH, SessionReader, SessionWriter, WriterOption
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.run_files import snapshot_path
-from flowrec.store.session_file import SessionFile, Snapshot
+from flowrec.store.session_file import SessionFile, Snapshot, Split
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of, write_session
 from tests.store.test_damage import names_in
 from tests.store.test_durability import slow_disk
@@ -186,6 +187,18 @@ def test_the_ring_takes_no_more_memory_than_it_may_and_says_what_it_holds(tmp_pa
     assert "of 8 s fit into 4 MB; set recording.snapshot_mb" in remark
 
 
+def test_only_a_snapshot_that_lacks_what_did_not_fit_into_memory_says_so(tmp_path):
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, (256, 256), dtype=np.uint8) for _ in range(8)]  # 65 kB that do not pack, ...
+    black = np.zeros((256, 256), np.uint8)  # ... and nothing that does
+    options = WriterOptions(files=Snapshot(2.0, 0.5, megabytes=3.0), block=True, queue_limit_bytes=1 << 20)
+    with SessionWriter(tmp_path / "x.mcap", HEADER, options) as writer:
+        for n, tick in enumerate(with_events((200, ("mark", "")), (500, ("mark", "")))):
+            writer.write(replace(tick, frame=Frame(tick.stamp_ns, n, noise[n % 8] if n < 240 else black)))
+    short = ["short_of_memory" in span_of(file)[2]["flowrec.outcome"] for file in writer.files]
+    assert short == [True, False]
+
+
 def test_a_place_that_may_not_be_written_or_is_taken_is_told_before_the_run(tmp_path):
     with pytest.raises(SessionError, match="no such directory"):
         SessionWriter(tmp_path / "missing" / "x.mcap", HEADER, WriterOptions(files=ABOUT))
@@ -257,3 +270,19 @@ def test_nothing_is_written_behind_what_the_disk_has_refused(tmp_path, monkeypat
     assert len(written) == 1
     with pytest.raises(SessionError, match="the disk is full"):
         file.check()
+
+
+@pytest.mark.parametrize("files", [Split(seconds=0.6), Snapshot(0.8, 0.4)])
+def test_no_number_of_a_message_is_missing_or_twice_between_a_keyframe_and_what_follows_it(files, tmp_path):
+    with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=files, block=True)) as writer:
+        for tick in islice(with_events((100, ("mark", "")), (250, ("mark", ""))), 300):
+            writer.write(tick)
+    assert len(writer.files) > 1
+    for piece in writer.files:
+        found = {}
+        with piece.open("rb") as stream:
+            for _, channel, message in make_reader(stream).iter_messages():
+                if channel.metadata.get("role") not in (None, "view") and channel.topic != "/camera/frame":
+                    found.setdefault(channel.topic, []).append(message.sequence)
+        for topic, numbers in found.items():
+            assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), (piece.name, topic)

@@ -7,11 +7,12 @@ from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowrec.core import BY_FIELD, SessionError, Tick
+from flowrec.core import BY_FIELD, Frame, SessionError, Tick
 from flowrec.physics import load_chip
 from flowrec.stages import load_config
 from flowrec.stages.resolve import resolve
@@ -27,7 +28,8 @@ from flowrec.store import (
     session_header,
     session_sha256,
 )
-from flowrec.store.run_files import partial_path, parts, run_files, snapshot_path
+from flowrec.store.run_files import Run, RunFile, partial_path, parts, run_files, snapshot_path
+from flowrec.store.session_file import Split
 from flowrec.verbs import Change
 from flowrec.verbs import session_replay as verb
 from flowrec.verbs.check import check
@@ -345,3 +347,27 @@ def test_parts_are_in_order_of_their_number_and_nothing_else_is_among_them(tmp_p
         path.touch()
     assert parts(run) == [part_path(run, number) for number in sorted(numbers)]
     assert set(run_files(run)) == {part_path(run, number) for number in numbers} | set(others[:2])
+
+
+def test_of_the_counts_of_parts_there_is_the_sum_and_of_what_is_told_of_the_last_alone_nothing():
+    told = {"outcome": "continued", "ticks": "7", "dropped_frames": "2", "frames_windows": "5 of 7 images"}
+    last = told | {"outcome": "reached", "ticks": "11", "note": "at the goal", "frames_missing_from_camera": "3"}
+    names = [part_path(Path("x.mcap"), number) for number in (1, 2)]
+    files = [RunFile(name, None, 0, 1, {}, outcome, 0, None) for name, outcome in zip(names, (told, last), strict=True)]
+    both = {"outcome": "reached", "ticks": "18", "dropped_frames": "4", "note": "at the goal"}
+    assert Run(Path("x.mcap"), files).outcome == both | {"frames_missing_from_camera": "3"}
+    assert Run(names[1], files[1:]).outcome == last
+
+
+def test_a_run_of_deep_images_without_its_last_part_is_given_an_end(tmp_path):
+    deep = [
+        replace(tick, frame=Frame(tick.stamp_ns, number, tick.frame.image.astype(np.uint16) << 3, 12))
+        for number, tick in enumerate(ticks_of(60, shape=(16, 16)))
+    ]
+    write_session(tmp_path / "x.mcap", deep, files=Split(seconds=0.3), bits=12, outcome={"outcome": "reached"})
+    *kept, last = parts(tmp_path / "x.mcap")
+    last.unlink()
+    assert len(kept) > 1 and recover_run(tmp_path / "x.mcap")[-1].lost == f"everything after {kept[-1].name}"
+    whole = SessionReader(tmp_path / "x.mcap")
+    assert whole.frame_bits == 12 and whole.outcome["outcome"] == "cut"
+    assert all(same(one, other) for one, other in zip(whole.ticks(), deep, strict=False))

@@ -218,6 +218,18 @@ def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, m
     assert recover(tmp_path / "x.part002.mcap.partial").ticks > 0
 
 
+def test_a_run_that_is_not_to_be_kept_leaves_no_part_though_its_disk_has_failed(tmp_path, monkeypatch):
+    def refuse(self, sealed, plain=McapWriter.add_chunks):
+        if "part003" in str(self._file.name) and self.size > 80_000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        plain(self, sealed)
+
+    monkeypatch.setattr(McapWriter, "add_chunks", refuse)
+    with pytest.raises(SessionError, match="nothing is left"):
+        write_session(tmp_path / "x.mcap", TICKS, files=Split(seconds=0.6), keep_failed=False)
+    assert names_in(tmp_path) == []
+
+
 KILLED = """
 import sys, time
 from flowrec.store.session_file import Split, WriterOptions

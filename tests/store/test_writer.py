@@ -10,7 +10,9 @@ import threading
 from collections import Counter
 from dataclasses import fields, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -27,6 +29,7 @@ from flowrec.store.viewer_topics import VIEWER_TOPICS
 from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, same, ticks_of, write_session
 
+session_writer = import_module("flowrec.store.session_writer")  # one of whose functions has its name
 TICKS = list(ticks_of(150))
 
 
@@ -360,3 +363,50 @@ def test_a_chunk_is_sealed_before_it_outgrows_what_a_reader_takes_and_no_message
     assert len(chunks) == 6 and all(80_000 < chunk.uncompressed_size < 101_000 for chunk in chunks)
     with pytest.raises(SessionError, match=r"/camera/frame .*\d+ bytes"):
         write_session(tmp_path / "y.mcap", ticks_of(1, shape=(400, 300)), frames="raw")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a system call of POSIX")
+def test_a_system_call_that_writes_a_part_of_what_it_is_given_is_followed_by_one_that_writes_the_rest(
+    tmp_path, monkeypatch
+):
+    write, rng = os.writev, np.random.default_rng(5)
+
+    def partly(handle, buffers):
+        taken = int(rng.integers(1, 1 + sum(map(len, buffers))))
+        return write(handle, [b"".join(buffers)[:taken]])
+
+    monkeypatch.setattr(os, "writev", partly)
+    path = write_session(tmp_path / "s.mcap", TICKS)
+    monkeypatch.undo()
+    assert all(same(one, other) for one, other in zip(SessionReader(path).ticks(), TICKS, strict=True))
+    assert digest_faults(path) == {path: []}
+
+
+@pytest.mark.parametrize(
+    ("sets", "queue_mb", "images_s"),
+    [
+        ({"width_px": 640, "height_px": 512, "rate_hz": 30.0}, 64.0, 0.5 + 64e6 / (640 * 512 * 30)),
+        ({"width_px": 2448, "height_px": 2048, "rate_hz": 30.0}, 4.0 * 2448 * 2048 * 30e-6, 4.5),
+        ({"width_px": 2448, "height_px": 2048, "rate_hz": 30.0, "bits": 12}, 8.0 * 2448 * 2048 * 30e-6, 4.5),
+        ({"width_px": 4096, "height_px": 4096, "rate_hz": 100.0}, 1250.0, 0.5 + 1.25e9 / (4096 * 4096 * 100)),
+    ],
+)
+def test_the_queue_holds_4_s_of_images_within_bounds_and_the_head_promises_no_less_a_loss(sets, queue_mb, images_s):
+    config = SimpleNamespace(
+        camera=SimpleNamespace(**{"bits": 8} | sets), recording=SimpleNamespace(queue_mb=None, flush_s=0.5)
+    )
+    assert session_writer.queue_bytes_of(config) == pytest.approx(1e6 * queue_mb, rel=1e-6)
+    for live, lost_s in ((True, images_s), (False, 0.5)):
+        told = session_writer._durability(config, live=live)
+        assert float(told["durability_images_s"]) == pytest.approx(lost_s, rel=0.006)
+        assert told["durability_state_s"] == "0.5"
+
+
+def test_an_image_without_the_rest_of_its_tick_is_no_tick_of_the_count(tmp_path):
+    whole, alone, other = TICKS[:3]
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
+        writer.write(whole)
+        writer.write(replace(whole, stamp_ns=alone.stamp_ns, frame=alone.frame))
+        writer.write(other)
+        assert writer.ticks == 2
+    assert SessionReader(writer.path).outcome["ticks"] == "2"

@@ -47,12 +47,13 @@ def test_images_that_the_machine_does_not_hold_are_refused_before_there_is_a_fil
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_that_is_stopped_before_it_begins_leaves_no_file_and_says_so(tmp_path: Path) -> None:
+@pytest.mark.parametrize("status", [130, 143])
+def test_a_run_that_is_stopped_before_it_begins_leaves_no_file_and_says_so(status: int, tmp_path: Path) -> None:
     control = RunControl()
-    control.stop("stopped by SIGTERM")
+    control.stop("stopped by SIGTERM", status=status)
     with pytest.raises(FlowrecError, match="SIGTERM") as refused:
         record(load_config(None, SMALL), tmp_path / "never.mcap", control=Unattended(control))
-    assert refused.value.exit_status in (130, 143) and not list(tmp_path.iterdir())
+    assert refused.value.exit_status == status and not list(tmp_path.iterdir())
 
 
 def test_whoever_accepts_losses_goes_on_and_the_session_says_what_the_machine_held(

@@ -16,6 +16,7 @@ import flowrec
 from flowrec.core import CameraLosses, Ended, SessionError, Tick
 from flowrec.store import SLOTS, SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.verbs.check import check
+from flowrec.verbs.verdict import Tally
 from tests.conftest import typed
 from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, packed_map, small_draft, text
 from tests.store.made_up import HEADER, ticks_of, write_session
@@ -213,8 +214,10 @@ def test_a_jump_of_the_wall_clock_is_told_and_does_no_harm(tmp_path, jump_s):
     # The draft's head says that both clocks read 1 ns at its beginning.
     ended = ending(outcome="reached", monotonic_ns=str(10**14), wall_ns=str(10**14 + jump_s * 10**9))
     path = file_of(tmp_path, replace(small_draft(), tail=ended))
-    said = [text for about, text in found(check(path)) if about == "clocks"]
+    verdict = check(path)
+    said = [text for about, text in found(verdict) if about == "clocks"]
     assert len(said) == bool(jump_s) and all(f"{jump_s:+.1f} s" in text for text in said)
+    assert f" {1000 * jump_s:+d} ms apart" in verdict.facts["clocks"]
     assert [tick.stamp_ns for tick in SessionReader(path).ticks()] == [10**9 + i * PERIOD_NS for i in range(TICKS)]
 
 
@@ -235,3 +238,23 @@ def test_a_track_at_the_border_is_doubted_also_where_the_session_states_no_doubt
     for name, recorded, doubted in (("a.mcap", at_border, True), ("b.mcap", ticks, False)):
         (file,) = in_parts(tmp_path / name, [], recorded)
         assert any("border" in finding.text for finding in check(file).findings) is doubted
+
+
+@pytest.mark.parametrize("frame", [True, False])
+@pytest.mark.parametrize("track", [True, False])
+@pytest.mark.parametrize("applied", ["", "with an image", "of an absent camera"])
+def test_a_tick_can_be_replayed_with_a_report_of_the_coils_and_an_image_or_a_track(frame, track, applied):
+    tally, tick = Tally(), next(ticks_of(1))
+    if frame:
+        tally.add("frame", 1, tick.frame)
+    if applied:
+        absent = {"absent_until_ns": tick.stamp_ns} if "absent" in applied else {}
+        tally.add("applied", 1, replace(tick.applied, **absent))
+    if track:
+        tally.add("track", 1, tick.track)
+    tally.close()
+    alone = frame and not applied and not track
+    missing = not alone and (not applied or not (frame or track or "absent" in applied))
+    none = not (frame or track or applied)
+    assert (tally.ticks, tally.images_alone) == (int(not alone and not none), int(alone))
+    assert tally.inputs_missing == int(missing and not none)

@@ -55,6 +55,8 @@ def test_the_help_of_replay_and_export_lists_every_method_of_every_table_with_it
         (["replay"], "SESSION"),
         (["nosuch"], "nosuch"),
         (["record", "--split", "3"], "--split 2GB,10min"),
+        (["record", "--split", "2GB,3GB"], "one size, one time, or both"),
+        (["record", "--snapshot", "30s,10s,5s"], "--snapshot 30s,10s"),
         (["record", "--goal", "1,2,3"], "--goal 4400,1500"),
         (["replay", SESSIONS / "golden.mcap", "--verify", "--refly"], "--verify"),
         (["replay", SESSIONS / "golden.mcap", "--verify", "--from", "nan"], "'--from': nan"),

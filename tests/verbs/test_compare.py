@@ -62,6 +62,15 @@ def test_single_numbers_that_are_not_finite_are_compared_too(recorded: float, re
     assert comparison.same is same
 
 
+@pytest.mark.parametrize("wrong", [NAN, INF, -INF])
+def test_a_number_that_is_not_finite_outweighs_every_difference_within_tolerance(wrong: float) -> None:
+    recorded, slightly = demand([[1.0, 1.0]], 1e4), demand([[1.0, 1.0]], 1e4 * (1.0 + 1e-7))
+    for sides in ((recorded, demand([[1.0, wrong]], 1e4 * (1.0 + 1e-7))), (demand([[1.0, wrong]], 1e4), slightly)):
+        comparison = Comparison()
+        comparison.add(*sides)
+        assert not comparison.same and comparison.first is not None and comparison.first.field == "sent_um_s"
+
+
 def test_a_message_that_only_one_side_has_is_a_difference() -> None:
     comparison = Comparison()
     comparison.add(demand([]), Tick(stamp_ns=0))

@@ -133,13 +133,26 @@ def test_a_camera_that_shows_the_chip_in_another_orientation_is_a_failure_with_t
     assert levels(with_sets(config, sets), tmp_path)["axes"] == OK
 
 
-@pytest.mark.parametrize(("speed", "level"), [(1e9, OK), (5e6, WARNING), (1e6, FAILURE)])
+# A run of that rate needs 3.64 MB/s.
+@pytest.mark.parametrize(
+    ("speed", "level"), [(1e9, OK), (7.3e6, OK), (7.2e6, WARNING), (3.7e6, WARNING), (3.6e6, FAILURE)]
+)
 def test_a_disk_is_judged_by_what_the_camera_delivers(
     speed: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: speed)
     monkeypatch.setattr(shutil, "disk_usage", lambda _folder: SimpleNamespace(free=10**12))
     assert levels(load_config(None, ["camera.rate_hz=20.0", "recording.admission_s=0"]), tmp_path)["disk"] == level
+
+
+@pytest.mark.parametrize(("free_gb", "level"), [(105.0, OK), (101.0, WARNING), (99.0, WARNING)])
+def test_a_disk_has_room_down_to_the_floor_at_which_a_run_is_ended(
+    free_gb: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _folder: SimpleNamespace(free=free_gb * 1e9))
+    asked = ["camera.rate_hz=20.0", "recording.admission_s=0", "recording.disk_floor_gb=100.0"]  # 2.2 GB in 10 minutes
+    assert levels(load_config(None, asked), tmp_path)["disk"] == level
 
 
 @pytest.mark.slow("flies the rehearsal of a mission")

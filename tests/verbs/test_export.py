@@ -7,6 +7,7 @@ import json
 import os
 import resource
 import shutil
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 
@@ -124,7 +125,8 @@ def test_no_text_of_a_csv_is_a_formula_and_each_can_be_had_back_exactly(tmp_path
 
     from flowrec.exports.tabular import CsvExport
 
-    texts = ["=1+1", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "'", "'=1", "\uff1d1", "plain = 1", '"=1"', "", None]
+    run = ("=", "+", "-", "@", "\t", "\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+    texts = [*(f"{begin}1+1" for begin in run), "'", "'=1", "plain = 1", '"=1"', "", None]
     batch = pyarrow.record_batch({"text": pyarrow.array(texts, pyarrow.string()), "number": [-1.5] * len(texts)})
     exporter = CsvExport()
     with exporter.open_writer(tmp_path / "a.csv", exporter.select(batch.schema)) as writer:
@@ -132,7 +134,7 @@ def test_no_text_of_a_csv_is_a_formula_and_each_can_be_had_back_exactly(tmp_path
     with (tmp_path / "a.csv").open(newline="", encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))
     assert [row["text"].removeprefix("'") for row in rows] == [text or "" for text in texts]
-    assert not any(row["text"].startswith(("=", "+", "-", "@", "\t", "\r", "\uff1d")) for row in rows)
+    assert not any(row["text"].startswith(run) for row in rows)
     assert {row["number"] for row in rows} == {"-1.5"}
 
 
@@ -211,3 +213,27 @@ def test_view_keeps_the_recording_of_an_unchanged_session_and_writes_that_of_a_c
         view(path, no_open=True)
     rrd.unlink()
     assert written_anew()
+
+
+def test_an_export_is_kept_until_what_it_is_made_of_or_the_code_that_made_it_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exporting = import_module("flowrec.exports.export")  # whose function has its name
+    code, session = tmp_path / "code" / "a.py", tmp_path / "s.mcap"
+    code.parent.mkdir()
+    for file in (code, session):
+        file.write_text("x")
+    monkeypatch.setattr(exporting, "PACKAGE", code.parent)
+    known = {exporting._made_from((session,))}
+    assert known == {exporting._made_from((session,))} and exporting._made_from(()) == ""
+    changes = (
+        lambda: code.write_text("xy"),
+        lambda: session.write_text("xy"),
+        lambda: os.utime(session, ns=(1, 1)),
+        lambda: code.with_name("b.py").write_text("x"),
+        session.unlink,
+    )
+    for number, change in enumerate(changes, 2):
+        change()
+        known.add(exporting._made_from((session,)))
+        assert len(known) == number

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,8 +13,9 @@ import pytest
 
 import flowrec
 from flowrec.core import UsageError
-from flowrec.physics import FlowSolver, chip_files
-from flowrec.stages import Config, FieldLog, load_config, to_toml
+from flowrec.physics import ORIENTATIONS, FlowSolver, chip_files
+from flowrec.stages import Config, FieldLog, MovieSettings, load_config, to_toml
+from flowrec.verbs import first_pass, misfit
 from flowrec.verbs.first_pass import MovieTracks, radius_in_image
 from flowrec.verbs.misfit import trembling as trembling_um
 from flowrec.verbs.misfit import why_unexplained
@@ -195,3 +198,48 @@ def test_a_body_without_an_outline_in_view_has_no_size() -> None:
     grey = np.full((100, 100), 180, np.uint8)
     grey[:, :50] = 60
     assert radius_in_image(grey, np.array([20.0, 50.0]), 5.0) == 0.0
+
+
+def test_the_first_image_of_a_shaking_movie_is_so_far_from_the_mean_place_of_all_that_they_lie_about_that() -> None:
+    shifts_px = np.random.default_rng(4).normal((7.0, -3.0), (2.0, 1.0), (200, 2))
+    shifts_px -= shifts_px[0]  # each is measured from the first image
+    config, facts = first_pass._with_mean_shift(Config(), shifts_px)
+    np.testing.assert_allclose((shifts_px + config.stabilise.first_px).mean(axis=0), 0.0, atol=1e-3)
+    rms_px, most_px = map(float, re.findall(r"[\d.]+", facts["source_shake"]))
+    assert rms_px == pytest.approx(np.sqrt(shifts_px.var(axis=0).sum()), abs=0.006) and most_px > 2.0 * rms_px
+    still, _ = first_pass._with_mean_shift(Config(), shifts_px / 100.0)
+    assert not any(still.stabilise.first_px), "what is less than a tenth of a pixel is no shake"
+
+
+def test_a_track_is_compared_with_what_the_log_drove_its_delay_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = FieldLog()
+    for number in range(20):
+        log.append(number * 10**8, 5.0, 0.4 * number, 4.0, np.zeros(3))
+    stamps_ns = np.arange(5, 19) * 10**8
+    driven_um = 30.0 * log.turns_until((stamps_ns - 7 * 10**7).astype(np.float64))  # 70 ms before
+    compared: list[np.ndarray] = []
+    monkeypatch.setattr(misfit, "own_gain", lambda _time_s, seen_um, own_um: compared.append(own_um - seen_um) or ())
+    monkeypatch.setattr(misfit, "orientation_by_motion", lambda *_: None)
+    seen = MovieTracks(stamps_ns, driven_um, log, None, False, UM_PER_PX, ())
+    config = SimpleNamespace(robot=SimpleNamespace(delay_s=0.07, um_per_rev=30.0, radius_um=1.0))
+    misfit.motion_by_log(seen, config)  # type: ignore[arg-type]
+    np.testing.assert_allclose(compared, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("offset_deg", "mirrored"), [(0.0, False), (25.0, False), (-140.0, True)])
+def test_the_settings_for_a_log_in_other_axes_turn_its_headings_to_where_the_robot_moves(
+    offset_deg: float, mirrored: bool
+) -> None:
+    logged_rad = np.radians([0.0, 20.0, 130.0, -75.0])
+
+    def directions(offset_deg: float, mirrored: bool) -> np.ndarray:
+        heading_rad = np.radians(offset_deg) + (-logged_rad if mirrored else logged_rad)
+        return np.stack([np.cos(heading_rad), np.sin(heading_rad)])
+
+    for orientation in ORIENTATIONS:
+        stated = MovieSettings(heading_offset_deg=offset_deg, heading_mirrored=mirrored)
+        text = misfit._log_settings(orientation, stated)
+        settings = load_config(None, [each.replace(" ", "") for each in text.split(", ")]).movie
+        assert -180.0 < settings.heading_offset_deg <= 180.0
+        found = directions(settings.heading_offset_deg, settings.heading_mirrored)
+        np.testing.assert_allclose(found, orientation.matrix @ directions(offset_deg, mirrored), atol=1e-9)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import MCAP, Output
+from flowrec.core import MCAP, Output, Phase
 from flowrec.run import before_after
 from flowrec.stages import load_config
 from flowrec.store import SessionReader
@@ -51,6 +51,10 @@ def test_the_end_of_a_mission_tells_its_outcome_its_way_what_was_won_and_where_t
     assert last.refined is not None and last.assumed is not None and last.route is not None
     assert facts["stated_flow_error"] == last.refined.error_share != last.assumed.error_share
     session = flowrec.open(mission.path)
+    assert last.mission is not None
+    phases = [(each.stamp_ns, each.phase) for each in session.messages("mission")]
+    began_ns = next(stamp_ns for stamp_ns, phase in phases if phase == Phase.NAVIGATE)
+    assert facts["navigation_s"] == pytest.approx(1e-9 * (last.mission.since_ns - began_ns))
     begin_um, config = last.route.waypoints_um[0], session.config
     by_length = replace(config.plan, method="astar_length")
     on_the_refined, on_the_assumed = (

@@ -36,6 +36,9 @@ def observed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_no_coil_is_ever_commanded_and_the_file_ends_with_the_refined_flow(observed: Path) -> None:
     with SessionReader(observed) as reader:
         ticks = list(reader.ticks())
+        length_s = 1e-9 * (reader.frame_stamps[-1] - reader.frame_stamps[0])
+        assert float(reader.outcome["duration_s"]) == pytest.approx(length_s, abs=0.01), "to the last image"
+    assert sum(tick.is_afterwards for tick in ticks) > 0
     assert all(tick.currents.amplitude_mt == 0.0 and not tick.currents.currents_a.any() for tick in ticks)
     assert not any(tick.demand.velocity_um_s.any() for tick in ticks)
     assert {tick.mission.phase for tick in ticks} == {"observe", "done"}

@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ import pytest
 from flowrec.core import FlowrecError, UsageError
 from flowrec.rigs import EmulatedCamera, EmulatedInstruments
 from flowrec.rigs.emulated.coils import OutputSamples, sample
-from flowrec.stages import Coils, load_config
+from flowrec.stages import Coils, Refiner, load_config
 from flowrec.store import Session
-from flowrec.verbs import protocol, ways_out
+from flowrec.verbs import protocol, protocol_rows, ways_out
 from flowrec.verbs.protocol import FAILED, NOT_DONE, PASSED, RESULTS, DayProtocol, walk
 from flowrec.verbs.protocol_hands import Answers, EmulatedHand, Person
 from flowrec.verbs.protocol_rows import ROWS, RowValue
@@ -118,6 +119,66 @@ def test_a_line_of_the_results_that_was_cut_off_is_measured_again(
     kept = tmp_path / RESULTS
     kept.write_bytes(kept.read_bytes()[:-20])
     assert results(walk(config, None, {}, tmp_path, Answers([])))["scale"] == NOT_DONE
+
+
+def test_of_a_run_from_which_a_row_has_failed_no_other_row_is_measured_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known: list[dict[str, Path]] = []
+
+    def measures(row: str, value: float) -> Any:
+        def measure(day: Any) -> RowValue:
+            known.append(dict(day.sessions))
+            return RowValue(value, 1.0, "", tmp_path / f"{row}_002.mcap")
+
+        return measure
+
+    shared = {"latency": measures("motion", 0.5), "um_per_rev": measures("motion", 2.0)}
+    rows_with(monkeypatch, scale=measures("still", 0.5), **shared)
+    config, hand = load_config(None, SMALL), Answers([MOUNTED])
+    walk(config, None, {}, tmp_path, hand)
+    known.clear()
+    walk(config, None, {}, tmp_path, hand)
+    assert known == [{"still": tmp_path / "still_002.mcap"}], "what failed is recorded anew"
+
+
+def measured(row: str, **config: Any) -> RowValue:
+    """A row of the table, for a day on which all that it runs has gone well."""
+    session = SimpleNamespace(path=Path("run.mcap"), config=SimpleNamespace(refine=Refiner(), flow=None), chip=None)
+    session.last = SimpleNamespace(tracer_flow=SimpleNamespace(position_um=np.zeros((4, 2))))
+    session.fields = {"assumed": SimpleNamespace(error_share=0.05)}
+    day = SimpleNamespace(run=lambda *_: session, config=SimpleNamespace(**config), asked=None)
+    day.hand = SimpleNamespace(read=lambda *_: "table.csv")
+    (value,) = (each.measure(day) for each in ROWS if each.name == row)  # type: ignore[arg-type]
+    return value
+
+
+def test_a_row_has_the_error_of_what_was_stated_in_its_unit_and_the_limit_that_it_promises(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fit = SimpleNamespace(offset_s=-0.08, offset_std_s=0.001, um_per_rev=33.0, um_per_rev_std=0.1)
+    monkeypatch.setattr("flowrec.measure.calibrate_motion", lambda _path: SimpleNamespace(fit=fit))
+    poses = [SimpleNamespace(calibration=SimpleNamespace(um_per_px=scale)) for scale in (2.0, 2.03, 1.99)]
+    monkeypatch.setattr("flowrec.measure.calibrate_image", lambda *_: SimpleNamespace(poses=poses))
+    made = SimpleNamespace(mt_per_a=np.array([[2.0, 0.3], [0.1, 2.0], [0.0, 0.4]]))
+    monkeypatch.setattr("flowrec.measure.calibrate_coils", lambda _path: SimpleNamespace(fit=made))
+    monkeypatch.setattr(protocol_rows, "flow_error", lambda *_: 0.08)
+    monkeypatch.setattr(
+        protocol_rows, "refine", lambda *_, **__: SimpleNamespace(refused="", note="", error_share=None)
+    )
+    camera, robot = SimpleNamespace(um_per_px=2.0, rate_hz=20.0), SimpleNamespace(delay_s=0.05, um_per_rev=30.0)
+    coils = SimpleNamespace(mt_per_a=((2.0, 0.0), (0.1, 2.0), (0.0, 0.0)))
+    found = {
+        row: measured(row, camera=camera, robot=robot, coils=coils)
+        for row in ("scale", "latency", "um_per_rev", "field", "flow")
+    }
+    assert {row: (pytest.approx(each.value), each.limit) for row, each in found.items()} == {
+        "scale": (1.5, 1.0),  # of the pose that is farthest from what was stated
+        "latency": (30.0, 50.0),  # 80 ms where 50 are stated, to the time between two images
+        "um_per_rev": (10.0, 10.0),
+        "field": (25.0, 5.0),  # of the second coil, (0.3, 0, 0.4) of (0, 2, 0)
+        "flow": (8.0, 10.0),  # twice the 5 % that the assumed map states
+    }
 
 
 def test_ways_out_that_a_person_has_timed_are_judged_by_the_slowest_and_one_that_was_not_is_told(

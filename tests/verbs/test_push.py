@@ -10,16 +10,18 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import flowrec
-from flowrec.archive.push import PushedFile, push
+from flowrec.archive.push import PushedFile, _pushed_notes, push
 from flowrec.archive.verbs import push as push_verb
-from flowrec.core import Ended, FlowrecError, StoppedError, UsageError
+from flowrec.core import Ended, FlowrecError, SessionError, StoppedError, UsageError
 from flowrec.store import TRAFFIC, Session, UrlPath, bucket_upload, part_path, remote_file, session_sha256
 from tests.conftest import HANG_S, invoke, until
 from tests.store.made_up import ticks_of, write_session
@@ -167,6 +169,22 @@ def test_what_another_upload_has_left_is_not_taken_for_ours(server: S3Server, la
     assert [each["UploadId"] for each in client.list_multipart_uploads(Bucket=BUCKET)["Uploads"]] == [foreign]
 
 
+def test_the_upload_that_was_interrupted_last_goes_on_however_many_others_have_left_before(large: Path) -> None:
+    data = large.read_bytes()
+    ages = {f"{age:02d}": data if age < 2 else bytes(len(data)) for age in range(20)}  # the two last ones are of ours
+
+    def answer(verb: str, UploadId: str = "", **_words: object) -> dict[str, object]:
+        if verb == "list_multipart_uploads":
+            times = {age: datetime(2026, 1, 1, tzinfo=UTC) - timedelta(hours=int(age)) for age in ages}
+            return {"Uploads": [{"Key": "x", "UploadId": age, "Initiated": times[age]} for age in sorted(ages)[::-1]]}
+        md5 = hashlib.md5(ages[UploadId][:PART_BYTES], usedforsecurity=False).hexdigest()
+        return {"Parts": [{"PartNumber": 1, "Size": PART_BYTES, "ETag": f'"{md5}"'}]}
+
+    with bucket_upload.LocalParts(large) as parts:
+        parts.part_bytes = PART_BYTES
+        assert bucket_upload._Upload(answer, "x", parts)._find_interrupted() == "00"
+
+
 @pytest.mark.slow("waits for a server in trouble")
 def test_a_server_in_trouble_is_asked_again_and_that_is_said(server: S3Server, large: Path) -> None:
     failing = iter([500, 503, None, None, 500])
@@ -219,12 +237,12 @@ class Pretending:
         return {"ETag": hashlib.md5(words["Body"]).hexdigest()}
 
 
-@pytest.mark.parametrize("kept", ["nothing", "a beginning", "zeros"])
+@pytest.mark.parametrize("kept", ["nothing", "a beginning", "more", "zeros"])
 def test_a_store_that_answers_well_and_keeps_something_else_is_found_out(
     server: S3Server, monkeypatch: pytest.MonkeyPatch, kept: str
 ) -> None:
     data = SESSION.read_bytes()
-    stored = {"nothing": None, "a beginning": data[:-1], "zeros": bytes(len(data))}[kept]
+    stored = {"nothing": None, "a beginning": data[:-1], "more": data + data[-9:], "zeros": bytes(len(data))}[kept]
     made = bucket_upload._client
     monkeypatch.setattr(bucket_upload, "_client", lambda folder: Pretending(made(folder), stored))
     done = push([SESSION], TARGET)
@@ -367,3 +385,40 @@ def test_two_sessions_of_one_name_are_refused(tmp_path: Path) -> None:
 def test_what_was_sent_by_an_earlier_call_is_told_apart(tmp_path: Path, sent: int, told: str) -> None:
     file = PushedFile(tmp_path / "a.mcap", UrlPath("s3://lab/a.mcap"), 3_000_000, sent, "", "by reading all of it")
     assert told in str(file)
+
+
+@pytest.mark.parametrize(
+    ("there", "sent"),
+    [
+        (None, True),
+        (b"", True),
+        (b"one\n", True),
+        (b"one\ntwo\n", False),
+        (b"one\ntwo\nthree\n", False),
+        (b"two\n", None),
+    ],
+)
+def test_lines_that_were_added_to_notes_are_sent_and_notes_that_have_more_or_others_stay(
+    there: bytes | None, sent: bool | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, stored = tmp_path / "a.mcap.notes.jsonl", tmp_path / "stored"
+    here.write_bytes(b"one\ntwo\n")
+    if there is not None:
+        stored.write_bytes(there)
+
+    def put(_name: str, data: bytes, replaces: str = "") -> str:
+        assert replaces == ("" if there is None else "etag")
+        stored.write_bytes(data)
+        return "new"
+
+    bucket = SimpleNamespace(
+        url=lambda _name: stored, stat=lambda _name: None if there is None else (1, "etag"), put=put
+    )
+    for name in ("forget", "_read_back"):
+        monkeypatch.setattr(sys.modules[push.__module__], name, lambda *_: "")
+    if sent is None:
+        with pytest.raises(SessionError, match="other notes"):
+            _pushed_notes(bucket, here)  # type: ignore[arg-type]
+    else:
+        assert _pushed_notes(bucket, here).sent_bytes == (8 if sent else 0)  # type: ignore[arg-type]
+    assert stored.read_bytes() == (here.read_bytes() if sent else there)

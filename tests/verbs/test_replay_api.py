@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import TOPICS, UsageError
+from flowrec.core import NS_PER_S, TOPICS, Estimate, FlowField, Observations, Tick, UsageError
+from flowrec.exports.report.history import History
+from flowrec.run import before_after
+from flowrec.run.replay_figures import CommandDifference, _residual_um_s
 from flowrec.verbs.replay_result import BeforeAfter
 from tests.conftest import HANG_S, invoke
 from tests.extras import why
@@ -120,3 +127,40 @@ def test_a_typed_change_reaches_the_replay_without_becoming_text() -> None:
     assert (typed.recording.operator, typed.recording.notes) == ("007", "true")
     assert typed.plan.speed_share == 0.1 + 0.2
     assert flowrec.Change(sets=["plan.speed_share=0.5"]) == flowrec.Change(sets={"plan.speed_share": 0.5})
+
+
+def test_what_each_map_leaves_of_the_flow_is_told_by_the_observations_of_the_replay() -> None:
+    def tick(vx: float, vy: float, *flow_um_s: tuple[float, float]) -> Tick:
+        velocity = np.broadcast_to((vx, vy), (8, 9, 2)).astype(np.float32)
+        field = FlowField(0, 0, "known", 20.0, velocity, np.zeros((8, 9)), None, np.zeros(1), 1.0, 1000.0, "")
+        places = np.array([[40.0, 60.0], [100.0, 80.0]])
+        return Tick(assumed=field, observations=Observations(0, places, np.array(flow_um_s), np.ones(2)))
+
+    config = SimpleNamespace(control=SimpleNamespace(method="pursuit"))
+    done = SimpleNamespace(
+        session=SimpleNamespace(config=config),
+        config=config,
+        commands=CommandDifference(),
+        recorded=tick(30.0, 0.0, (900.0, 0.0), (900.0, 0.0)),
+        replayed=tick(33.0, 4.0, (33.0, 0.0), (33.0, 8.0)),
+    )
+    told = {key: (was, now) for key, was, now in before_after(done)}  # type: ignore[arg-type]
+    # Lengths of the misses: 3 and the root of 73 um/s on the recorded map, twice 4 on the other.
+    assert told["residual_um_s"] == (pytest.approx(math.sqrt((9.0 + 73.0) / 2.0)), pytest.approx(4.0))
+
+
+def test_a_map_that_has_found_another_registration_is_compared_where_the_image_shows_its_places() -> None:
+    columns = np.broadcast_to(np.arange(9.0)[None, :, None], (8, 9, 2)).astype(np.float32)  # um/s, a pixel 1 more
+    field = FlowField(0, 0, "known", 20.0, columns, np.zeros((8, 9)), None, np.zeros(1), 1.0, 1000.0, "")
+    field = replace(field, registration=np.array([[1.0, 0.0, 40.0], [0.0, 1.0, 0.0]]))  # two pixels to the right
+    seen = Observations(0, np.array([[60.0, 60.0], [80.0, 80.0]]), np.array([[5.0, 5.0], [6.0, 6.0]]), np.ones(2))
+    assert _residual_um_s(field, seen) == pytest.approx(0.0, abs=1e-5)
+    history = History(0, NS_PER_S)
+    history.add(
+        Tick(
+            1,
+            estimate=Estimate(1, np.array([60.0, 60.0]), np.zeros(2), np.eye(4), 1.0, np.zeros(2), True),
+            refined=field,
+        )
+    )
+    assert history.curve("map_x_um_s").known == pytest.approx([5.0])

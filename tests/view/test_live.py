@@ -8,6 +8,7 @@ import socket
 import subprocess
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from flowrec.core import Frame, Tick
 from flowrec.exports import scene_of
 from flowrec.store import Session
 from flowrec.view import LiveView, Scene, document_of_run, viewer
+from flowrec.view.feed import Feed
 from flowrec.view.live import ABSENT_S
 from flowrec.view.summary_text import LiveSummary
 from tests.conftest import HANG_S, until
@@ -203,3 +205,15 @@ def text_of(document: rr.TextDocument) -> str:
     assert document.text is not None
     (text,) = document.text.as_arrow_array().to_pylist()
     return str(text)
+
+
+def test_an_image_is_sent_with_the_tick_that_it_belongs_to_and_with_no_other() -> None:
+    feed, newest = Feed.__new__(Feed), Frame(3, 2, np.full((720, 1800), 7, np.uint8))
+    feed._shown, feed._remarks, feed._frame = ("frame",), dict, newest
+    for index, image in ((1, None), (2, newest.image[::3, ::3])):
+        tick = Tick(index, frame=Frame(index, index, np.zeros((0, 0), np.uint8)))
+        feed._queue = deque([tick])
+        batch, _ = feed._batch(Tick())
+        sent = batch.changes[-1]["frame"].image
+        np.testing.assert_array_equal(sent, np.zeros((0, 0)) if image is None else image)
+        assert batch.step == (1 if image is None else 3), "the longer side has at most 720 pixels"

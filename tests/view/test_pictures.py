@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 import rerun as rr
 
 from flowrec.console.page_state import SHOWN, PageState
-from flowrec.core import Applied, FlowField, Measured, Outcome, Shift, Tick
+from flowrec.core import Applied, CameraLosses, Drops, FlowField, Measured, Outcome, Shift, Tick
 from flowrec.physics import Calibration, sample
 from flowrec.stages import figures_of
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
@@ -26,9 +27,12 @@ from flowrec.view import (
     flow_values,
     maps,
     registration_remark,
+    scale_of,
 )
-from flowrec.view.entities import TIME_TO_GO
+from flowrec.view.drawing import encode_jpeg
+from flowrec.view.entities import LOSSES, TIME_TO_GO
 from flowrec.view.logger import TickLogger
+from flowrec.view.state_lanes import StateLogger
 from flowrec.view.summary_text import LiveSummary
 
 
@@ -347,3 +351,53 @@ def test_a_map_that_comes_later_says_so_until_it_is_there(scene: Scene, ticks: l
     logger.log(Tick(1, assumed=field))
     assert isinstance(record.logged[assumed], rr.Clear)
     assert not isinstance(record.logged[refined], rr.Clear)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_a_preview_of_a_deep_image_has_its_upper_8_bits(bits: int) -> None:
+    levels = np.linspace(0, 2**bits - 1, 256).round().astype(np.uint8 if bits == 8 else np.uint16)
+    image = np.repeat(levels[None], 64, axis=0)
+    seen = cv2.imdecode(np.frombuffer(encode_jpeg(image, bits, 95), np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(seen.astype(float), image >> (bits - 8), atol=2.0)
+
+
+@pytest.mark.parametrize("table", ["speed", "uncertainty", "change", "time"])
+def test_a_scale_reaches_to_all_but_a_hundredth_of_a_map_and_not_far_beyond(table: Any) -> None:
+    rng = np.random.default_rng(11)
+    for size in 10.0 ** np.arange(-3, 5):
+        values = (
+            size * np.abs(rng.normal(size=(40, 50))) * (rng.choice((-1.0, 1.0), (40, 50)) if table == "change" else 1)
+        )
+        values[0, :5], values[1] = 1e3 * size, np.nan  # corners, and solid
+        scale = scale_of(values, table)
+        known = np.abs(values[np.isfinite(values)])
+        assert (known > scale.high).mean() < 0.01 and scale.low == (-scale.high if table == "change" else 0.0)
+        assert scale.high < 1.7 * np.quantile(known, 0.995), "the colours are of what is there"
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (Drops(1, "/camera/frame", 2, 0, 1), "2 lost"),
+        (Drops(1, "/camera/frame", 0, 3, 1), "3 lost"),
+        (Drops(1, "/camera/frame", 2, 3, 4), "5 lost, every 4. kept"),
+        (Drops(1, "/camera/frame", 0, 0, 1), None),
+        (CameraLosses(1, 967, 950, 2, 3, 5, 7, 0, 0), "17 lost before the loop"),
+        (CameraLosses(1, 967, 967, 0, 0, 0, 0, 0, 0), None),
+    ],
+)
+def test_the_lane_of_losses_counts_those_of_camera_and_disk(message: Any, said: str | None) -> None:
+    told: list[Any] = []
+    logger = StateLogger(SimpleNamespace(log=lambda *of, **_: told.append(of)), doubtful=False)  # type: ignore[arg-type]
+    logger.log(message)
+    assert logger._now == ({} if said is None else {LOSSES: said}) and bool(told) == (said is not None)
+
+
+@pytest.mark.parametrize("scale", [ColourScale("speed", 0.0, 8.0, 2.0), ColourScale("change", -8.0, 8.0, 4.0)])
+def test_the_colours_of_a_scale_go_from_its_low_end_to_its_high_end(scale: ColourScale) -> None:
+    table = scale.paint(np.linspace(scale.low, scale.high, 256))
+    assert len(np.unique(table, axis=0)) > 200
+    middle = 0.5 * (scale.low + scale.high)
+    found = scale.paint([scale.low - 9.0, scale.low, middle, scale.high, scale.high + 9.0, np.nan])
+    np.testing.assert_allclose(found[:5].astype(int), table[[0, 0, 128, 255, 255]].astype(int), atol=2)
+    assert tuple(found[5]) == colours.SOLID

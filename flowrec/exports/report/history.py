@@ -30,7 +30,7 @@ from flowrec.core import (
 )
 from flowrec.exports.formats import TimeProgress
 from flowrec.exports.report.curves import Curve, CurveBuilder, SpanBuilder
-from flowrec.physics import sample
+from flowrec.physics import sample_as_seen
 from flowrec.store import Session
 
 _MOST_REMARKS = 300  # events and actions of the operator; of more, the first
@@ -201,7 +201,7 @@ class History:
         put(flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1])
         put(flow_std_um_s=flow_std)
         if tick.field is not None:
-            on_map = sample(tick.field, position_um)
+            on_map = sample_as_seen(tick.field, position_um)
             put(map_x_um_s=on_map[0], map_y_um_s=on_map[1])
         if tick.truth is not None and tick.truth.stamp_ns == stamp_ns:
             put(estimate_error_um=math.dist(position_um, tick.truth.position_um))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,12 +12,14 @@ import numpy as np
 import pytest
 
 from flowrec.core import Currents, RigError, UsageError
-from flowrec.physics import Robot
+from flowrec.physics import ChipSettings, Robot, load_chip
 from flowrec.rigs import CommandLimits, Guardian
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
+from flowrec.rigs.lab.amplifiers.serial_line import SerialAmplifier
+from flowrec.rigs.lab.amplifiers.serial_protocol import Telemetry
 from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.rigs.lab.guardian import watch
-from flowrec.stages import Coils, FieldCommand, OutputLimits
+from flowrec.stages import Coils, FieldCommand, FieldLog, OutputLimits, load_config, resolve
 
 ON, OFF, TRIP, QUIT, PROBE = b"1", b"0", b"T", b"Q", b"P"
 
@@ -109,6 +112,7 @@ class Told:
     def __init__(self) -> None:
         self.beats: list[bool] = []
         self.amplitudes_mt: list[float] = []
+        self.log = FieldLog()
 
     def open(self) -> AmplifierInfo:
         return AmplifierInfo("told", "", 10.0, 100.0, 1e5, latency_s=0.01, timer_s=self.timer_s)
@@ -118,6 +122,9 @@ class Told:
 
     def apply(self, command: FieldCommand) -> None:
         self.amplitudes_mt.append(command.amplitude_mt)
+
+    def put_out(self, until_ns: int) -> FieldLog:
+        return self.log
 
     def arm(self) -> None: ...
 
@@ -190,3 +197,43 @@ def test_an_amplifier_whose_timer_is_shorter_than_two_beats_is_refused() -> None
     told.timer_s = 1.9 * BEAT_S
     with pytest.raises(UsageError, match=r"0\.02 s; .*0\.04 s"), driven(told, Clock()):
         pytest.fail("it opened")
+
+
+def test_a_loop_may_wait_as_long_as_the_watchdog_of_its_ticks_allows_before_the_guardian_hears_it_no_more() -> None:
+    told: list[float] = []
+
+    class Asked(Drive):
+        def __init__(self, amplifier: object, limits: CommandLimits, silence_s: float, patience_s: float) -> None:
+            told.extend((silence_s, patience_s))
+
+    config = resolve(load_config(None, ["safety.guard_timeout_s=0.7", "lab.guardian_s=0.2"]), load_chip(ChipSettings()))
+    Asked.of(config)
+    assert told == [0.2, pytest.approx(0.9)]
+
+
+def test_the_turns_between_frames_add_up_to_those_of_the_log_however_late_it_was_written() -> None:
+    told = Told()
+    with driven(told, Clock()) as drive:
+        told.log.append(0, 5.0, 0.0, 4.0, np.zeros(3))
+        turns = [drive.applied_at(number * 10**8, (number - 1) * 10**8).turns for number in (1, 2)]
+        np.testing.assert_allclose(turns, [[0.5, 0.0], [0.5, 0.0]])
+        told.log.append(150_000_000, 2.0, 0.5 * math.pi, 4.0, np.zeros(3))  # only now it says what it did
+        told.log.append(230_000_000, 3.0, math.pi, 4.0, np.zeros(3))
+        turns += [drive.applied_at(number * 10**8, (number - 1) * 10**8).turns for number in (3, 4)]
+    np.testing.assert_allclose(sum(turns), told.log.turns(0, 4 * 10**8), atol=1e-9)
+
+
+def test_a_board_whose_counters_overflow_has_turned_as_far_in_the_middle_of_each_round_trip() -> None:
+    board, wrap, hz, heading_rad = SerialAmplifier("", 115200, Coils()), 1 << 32, 5.0, 2.0
+    for number in range(400):
+        at_ns, began_ns = 10**9 + number * 10**7, 10**9  # the board answers in the middle
+        turned = hz * 1e-9 * (at_ns - began_ns) * np.array([math.cos(heading_rad), math.sin(heading_rad)])
+        offset = np.array([4 * 10**6, -9 * 10**6])
+        x, y = np.rint(1e6 * turned + offset).astype(int).tolist()  # both pass 0 on their way
+        clock_us = (at_ns // 1000 + wrap - 3 * 10**6) % wrap
+        answer = Telemetry(clock_us, hz, heading_rad, 4.0, (x % wrap, y % wrap), np.zeros(3))
+        board._measured.append((answer, at_ns - 3_000_000, at_ns + 3_000_000))
+    log = board.put_out(at_ns)
+    np.testing.assert_allclose(log.turns(2 * 10**9, 4 * 10**9), 2.0 * hz * np.array([-0.41615, 0.90930]), rtol=1e-3)
+    late_ns = (log.times_ns[-100:] - 10**9) % 10**7
+    assert np.minimum(late_ns, 10**7 - late_ns).max() < 300_000, "stamped when it was, not when its answer came"

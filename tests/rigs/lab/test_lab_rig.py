@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
+from types import SimpleNamespace, TracebackType
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from flowrec.core import Applied, Currents, FlowrecError, Measured, RigError, Us
 from flowrec.physics import chip_files, load_chip
 from flowrec.rigs import CameraInfo, Grabbed, Wanted, checked_images
 from flowrec.rigs.lab.cameras.grabber import Grabber
+from flowrec.rigs.lab.drive import BEAT_S
 from flowrec.rigs.lab.rig import LabRig
 from flowrec.stages import ResolvedConfig, Sight, assemble, load_config, look
 from flowrec.stages.resolve import resolve
@@ -355,3 +356,11 @@ def test_a_loop_that_waits_for_an_image_beats_at_once_when_the_field_is_to_rest(
         until(lambda: rig.rest() or waited)
         thread.join()
         assert waited == [None] and "let go" in coils.calls
+
+
+def test_a_tick_without_an_image_comes_before_a_frame_whose_exposure_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 10**10)
+    config = SimpleNamespace(camera=SimpleNamespace(exposure_s=0.2), lab=SimpleNamespace(camera_delay_s=0.05))
+    before_ns = 10**10 - LabRig._absent_ns(SimpleNamespace(_config=config), SimpleNamespace(stamp_ns=int))  # type: ignore[arg-type]
+    # Of one that arrives within a beat the middle of the exposure was so long ago.
+    assert before_ns >= 1e9 * (0.5 * 0.2 + 0.05 + BEAT_S)

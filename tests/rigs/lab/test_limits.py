@@ -131,7 +131,11 @@ def test_currents_that_nobody_measures_can_not_be_compared() -> None:
 def test_impossible_numbers_become_zero_field_and_are_told_once() -> None:
     told: list[str] = []
     limits = CommandLimits(CURRENT, ROBOT, OutputLimits(), told.append)
-    for spoiled in ((math.nan, 0.0, 4.0, 9.0), (5.0, math.inf, 4.0, 9.0), (5.0, 0.0, -4.0, 9.0), (-5.0, 0.0, 4.0, 9.0)):
+    impossible = (math.nan, math.inf, -math.inf, -4.0)
+    right = (5.0, 0.0, 4.0, 9.0)
+    spoiled_ones = [(*right[:at], wrong, *right[at + 1 :]) for at in range(4) for wrong in impossible]
+    spoiled_ones.remove((5.0, -4.0, 4.0, 9.0))  # a heading may be negative
+    for spoiled in spoiled_ones:
         admitted = limits.admit(command(*spoiled), 0)
         assert (admitted.amplitude_mt, admitted.frequency_hz) == (0.0, 0.0)
     assert len(told) == 1 and "impossible" in told[0]

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from flowrec.core import RigError
-from flowrec.rigs import Wanted
+from flowrec.rigs import CameraInfo, Wanted
+from flowrec.rigs.lab.cameras.device_counts import Stamper
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from tests.conftest import HANG_S
 from tests.rigs.lab.cameras.scripted import GONE, INFO, WANTED, Scripted, Step, block
@@ -221,3 +222,14 @@ def test_a_defect_of_a_driver_reaches_the_loop() -> None:
         following(grabber)
         with pytest.raises(ValueError, match="defect"):
             grabber.next(HANG_S)
+
+
+def test_a_clock_that_stands_still_is_left_alone_after_every_connection() -> None:
+    stamper, info = Stamper(), CameraInfo("m", "s", 8, 8, 8, 30.0, ticks_per_s=1e9)
+    arrivals = iter(range(0, 10**10, 33_000_000))
+    for _ in range(3):
+        stamper.reset(info, 0.0, 0.0)
+        assert not stamper.frozen
+        stamps = [(stamper.take(77, arrival_ns), arrival_ns) for arrival_ns in (next(arrivals) for _ in range(6))]
+        assert stamper.frozen, "the operator is told"
+        assert all(stamp_ns == arrival_ns and fit is None for (stamp_ns, fit, _), arrival_ns in stamps[2:])
