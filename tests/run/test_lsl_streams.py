@@ -145,6 +145,7 @@ def test_a_killed_outlet_is_silent_at_once_and_heard_again_when_it_is_restarted(
         assert any("its outlet has ended; it is looked for again" in line for line in told)
 
 
+@pytest.mark.slow("restarts an outlet; a restart with the same channels stands above")
 def test_a_restart_with_other_channels_stays_silent_and_is_told_once(name: str) -> None:
     told: list[str] = []
     with Listening(told, pump=StreamSettings(outlet=name, wait_s=0.1)) as heard:

@@ -100,7 +100,13 @@ def test_what_aravis_sends_is_handed_on_or_counted_and_the_library_counts_the_sa
 
 
 @aravis
-@pytest.mark.parametrize("kill", [True, False], ids=["killed", "cable pulled"])
+@pytest.mark.parametrize(
+    "kill",
+    [
+        pytest.param(True, marks=pytest.mark.slow("loses a camera in the other way"), id="killed"),
+        pytest.param(False, id="cable pulled"),
+    ],
+)
 def test_an_unplugged_camera_is_recognised_and_resumed(port_3956: None, kill: bool) -> None:
     with Aravis() as camera, grabbing() as (grabber, _):
         before = frames_of(grabber, 5)[-1]
