@@ -9,9 +9,11 @@ the Gaussian reaches.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
+from flowrec.core import FlowError
 from flowrec.physics import Chip
 from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.hypothesis import first_evidence
@@ -33,8 +35,11 @@ def at_observed_inflow(chip: Chip, observe: Callable[[Chip], Observed]) -> tuple
     if REACHED[0] < ratio < REACHED[1] or abs(ratio) > OTHER_UNIT:
         return chip, stated
     other = chip.with_boundary(np.copysign(2.0 ** np.round(np.log2(abs(ratio))), ratio) * chip.boundary_values)
-    observed = observe(other)
-    return (other, observed) if _evidence(observed) - _evidence(stated) > -np.log(SHARE) else (chip, stated)
+    with suppress(FlowError):  # a flow so fast that it can not be computed
+        observed = observe(other)
+        if _evidence(observed) - _evidence(stated) > -np.log(SHARE):
+            return other, observed
+    return chip, stated
 
 
 def _ratio(observed: Observed) -> float:

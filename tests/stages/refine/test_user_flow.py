@@ -191,6 +191,17 @@ def test_speeds_far_above_all_that_the_method_can_follow_are_refused_with_the_un
     assert refined.velocity_um_s[16, 30, 0] == pytest.approx(1.5 * 150.0 * factor, rel=0.05)
 
 
+def test_speeds_at_which_the_flow_can_not_be_computed_are_refused_with_the_speed_to_give() -> None:
+    mask = np.zeros((40, 60), np.bool_)
+    mask[18:24] = mask[5:35, 20:40] = True
+    mask[11:29, 26:34] = False
+    options: Any = {"um_per_px": 1000.0, "inlet_speed_um_s": 5000.0, "inlets": ("left",)}
+    places = 1000.0 * np.column_stack([np.linspace(3.0, 18.0, 30), np.tile([20.0, 21.0, 22.0], 10)])
+    measured = 50.0 * sample(flowrec.solve(mask, **options), places)
+    with pytest.raises(UsageError, match="give inlet_speed_um_s near 250000"):
+        flowrec.refine(mask, np.hstack([places, measured]), **options)
+
+
 @pytest.mark.parametrize(("seed", "factor"), [(0, 8.0), (0, -12.0), (2, 13.0), (1, -45.0), (3, 96.0)])
 def test_a_flow_many_times_as_fast_as_assumed_either_way_is_found_and_told_in_the_note(
     seed: int, factor: float
