@@ -61,6 +61,7 @@ from .robot_topics import (
 )
 from .refine.case import Case as Case
 from .refine.findings import map_doubts as map_doubts
+from .refine.misstated_inflow import ratios_along as ratios_along
 from .refine.network import UNet as UNet, trained_network as trained_network
 from .refine.network_fit import Device as Device, torch_run as torch_run
 from .refine.network_inputs import LEAST_SPEED as LEAST_SPEED, LOG_STD as LOG_STD, NetworkInputs as NetworkInputs

@@ -22,11 +22,10 @@ from flowrec.physics import (
     sample,
     without_pockets,
 )
-from flowrec.stages import Refiner
+from flowrec.stages import Refiner, ratios_along
 from flowrec.store import observations_of
 
 _OTHER_WAY_UP = 0.8  # of the measured speed in fluid if y is counted upwards, and less than half of it as given
-_SLOW = 0.1  # of the fastest assumed flow at the measured places: slower ones say nothing of the unit
 _TIMES = 10.0  # faster or slower than assumed: the unit is doubted
 _SURE, _MAD = 3.0, 1.48  # standard errors; a standard deviation over the median of the deviations
 _BEHIND = 1.2  # times as fast as the map: it does not follow what was measured
@@ -246,12 +245,10 @@ def _times(measured: Observations, field: FlowField, chip: Chip) -> float | None
     inside = _in_fluid(measured, chip)
     flow, std = measured.flow_um_s[inside], measured.std_um_s[inside]
     there = sample(field, measured.position_um[inside])
-    square = (there**2).sum(axis=1)
-    fast = square > _SLOW**2 * square.max(initial=0.0)
-    if not fast.any():
+    ratio, fast = ratios_along(flow, there)
+    if not len(ratio):
         return None
-    ratio = (flow * there).sum(axis=1)[fast] / square[fast]
     times = float(np.median(ratio))
-    stated, seen = np.median(std[fast] / np.sqrt(square[fast])), _MAD * np.median(np.abs(ratio - times))
+    stated, seen = np.median(std[fast] / np.hypot(*there[fast].T)), _MAD * np.median(np.abs(ratio - times))
     error = float(max(stated, seen)) / np.sqrt(len(ratio))
     return times if _SURE * error < max(abs(times), 1.0 / _TIMES) else None

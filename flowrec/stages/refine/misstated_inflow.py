@@ -13,7 +13,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from flowrec.core import FlowError
+from flowrec.core import Bools, Floats, FlowError
 from flowrec.physics import Chip
 from flowrec.stages.refine.causes import Observed
 from flowrec.stages.refine.hypothesis import first_evidence
@@ -22,7 +22,7 @@ from flowrec.stages.refine.noise import outlying, robust_noise
 REACHED = (-0.25, 2.0)  # ratios to the stated inflow that the Gaussian reaches: five standard deviations down, four up
 OTHER_UNIT = 100.0  # ratio from which on it is not the pump that is wrong, but the unit of the observations
 SHARE = 5e-4  # prior probability of that: one observation, which may be wrong, gains up to 7.1 nats, two gain 14
-_SLOW = 0.1  # of the fastest predicted flow: slower places say little of the ratio
+_SLOW = 0.1  # of the fastest predicted flow
 
 
 def at_observed_inflow(chip: Chip, observe: Callable[[Chip], Observed]) -> tuple[Chip, Observed]:
@@ -31,7 +31,8 @@ def at_observed_inflow(chip: Chip, observe: Callable[[Chip], Observed]) -> tuple
     With them the observations in its flow, as `observe` gives them.
     """
     stated = observe(chip)
-    ratio = _ratio(stated)
+    ratios, _ = ratios_along(stated.operator.flow_um_s, stated.operator.predict(stated.model.base))
+    ratio = float(np.median(ratios)) if len(ratios) else 1.0
     if REACHED[0] < ratio < REACHED[1] or abs(ratio) > OTHER_UNIT:
         return chip, stated
     other = chip.with_boundary(np.copysign(2.0 ** np.round(np.log2(abs(ratio))), ratio) * chip.boundary_values)
@@ -42,13 +43,11 @@ def at_observed_inflow(chip: Chip, observe: Callable[[Chip], Observed]) -> tuple
     return chip, stated
 
 
-def _ratio(observed: Observed) -> float:
-    """Median ratio of what was observed to the assumed flow, along that; 1 where nothing flows."""
-    predicted = observed.operator.predict(observed.model.base)
-    square = (predicted**2).sum(axis=1)
-    moves = square > _SLOW**2 * square.max()
-    along = (observed.operator.flow_um_s * predicted).sum(axis=1)
-    return float(np.median(along[moves] / square[moves])) if moves.any() else 1.0
+def ratios_along(flow_um_s: Floats, predicted_um_s: Floats) -> tuple[Floats, Bools]:
+    """Ratios (k,) of flows (n, 2) to predicted ones (n, 2), along these, and (n,) where: slow places say little."""
+    square = (predicted_um_s**2).sum(axis=1)
+    moves = square > _SLOW**2 * square.max(initial=0.0)
+    return (flow_um_s * predicted_um_s).sum(axis=1)[moves] / square[moves], moves
 
 
 def _evidence(observed: Observed) -> float:
