@@ -120,6 +120,15 @@ def test_what_depends_on_the_chip_alone_can_be_prepared_and_changes_no_result(tw
     assert in_order > 20 and left <= 2, "only the walls that the observations ask for have a flow yet to compute"
 
 
+@pytest.mark.parametrize("times", [12.0, -12.0])
+def test_the_next_stretch_of_a_survey_counts_with_a_flow_many_times_as_fast_as_the_assumed_one(twin, times):
+    case = twin()
+    faster = replace(case.observations, flow_um_s=times * case.observations.flow_um_s)
+    found = Refiner().uncertainty(case.assumed, faster, case.chip, case.solver)
+    true_um_s = times * case.true.velocity_um_s[case.chip.mask]
+    assert np.linalg.norm(found.mean_um_s - true_um_s) < 0.05 * np.linalg.norm(true_um_s)
+
+
 def test_an_unknown_method_is_an_error_that_names_the_nearest(twin):
     for use in (lambda: refine(Refiner("kalman"), twin()), lambda: Refiner("kalman").weights_sha256):
         with pytest.raises(UsageError, match=r"refine\.method = 'kalman': .* assimilate, "):
