@@ -260,16 +260,17 @@ def shape_error(message: Message) -> str:
 
     The wire keeps any shape, so a damaged or forged file is refused here, before its arrays are used.
     """
-    return shape_fault(type(message), lambda name: None if (array := getattr(message, name)) is None else array.shape)
+    return shape_fault(type(message), functools.partial(getattr, message))
 
 
-def shape_fault(message_type: type, shape_of: Callable[[str], tuple[int, ...] | None]) -> str:
-    """Error text as `shape_error`, for shapes by the name of the field; None for an array that is not there."""
+def shape_fault(message_type: type, array_of: Callable[[str], NDArray[Any] | tuple[float, ...] | None]) -> str:
+    """Error text as `shape_error`, for arrays by the name of the field: tuples for vectors, None for missing ones."""
     lengths: dict[str, int] = {}
     for name, wanted in array_shapes(message_type):
-        shape = shape_of(name)
-        if shape is None or shape == wanted:
+        array = array_of(name)
+        if array is None:
             continue
+        shape = (len(array),) if isinstance(array, tuple) else array.shape
         fits = len(shape) == len(wanted)
         for found, length in zip(shape, wanted, strict=False):
             if isinstance(length, int):

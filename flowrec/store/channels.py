@@ -9,14 +9,14 @@ neither images nor previews. Channel numbers depend on the tables only: the same
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from operator import attrgetter
 from typing import Any
 
 from google.protobuf import descriptor_pb2
 from mcap.records import Channel
 from mcap.records import Schema as SchemaRecord
-from numpy.typing import NDArray
 
 from flowrec.core import (
     BY_FIELD,
@@ -236,7 +236,7 @@ class SessionContents(SessionMetadata):
                 row = tuple([unpack(parsed) for unpack in unpack_all])
             except Exception:  # noqa: BLE001 - the careful decoder says what is wrong with it, as for every reader
                 return whole(record)
-            if arrays and (fault := shape_fault(kind, lambda name: _shape(row[arrays[name]]))):
+            if arrays and (fault := shape_fault(kind, lambda name: row[arrays[name]])):
                 raise SessionError(fault)
             return row
 
@@ -249,7 +249,7 @@ class SessionContents(SessionMetadata):
         kind = topic.type
         codec = self.codecs[channel_number] = message_codec(kind, found.name, self.frame_bits, topic.path)
         expected = codec.schema
-        ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
+        ours_all = frozenset(map(attrgetter("name"), message_fields(kind)))
         self.recorded_fields[self.fields[channel_number]] = ours_all
         same_kind = (found.name, found.encoding, channel.message_encoding) == (expected.name, "protobuf", "protobuf")
         # The standard schemas may gain fields and comments with a new foxglove-sdk and stay compatible.
@@ -268,12 +268,6 @@ class SessionContents(SessionMetadata):
             f"{self.source.path}: {channel.topic} has another schema ({', '.join(differs)});"
             f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
         )
-
-
-def _shape(value: tuple[float, ...] | NDArray[Any] | None) -> tuple[int, ...] | None:
-    if value is None:
-        return None
-    return (len(value),) if isinstance(value, tuple) else value.shape
 
 
 def bits_from(metadata: Mapping[str, str]) -> int:

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from flowrec.core import (
     NS_PER_S,
     Event,
-    Floats,
     Frame,
     Level,
     MessageField,
@@ -70,6 +69,7 @@ class Codec:
     has_unix_time: bool = False
 
 
+_VECTOR = functools.partial(np.fromiter, dtype=np.float64)
 _CODECS: dict[tuple[type[Any], str], Codec] = {}
 
 
@@ -236,7 +236,7 @@ def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memor
 
 def unpackers(message_type: type[Any], vector_of: Callable[[Any], Any] | None = None) -> list[Callable[[Any], Any]]:
     """Functions that take the fields out of a parsed message; `vector_of` is used for vectors in place of arrays."""
-    return [_unpacker(form, vector_of or _vector) for form in message_fields(message_type)]
+    return [_unpacker(form, vector_of or _VECTOR) for form in message_fields(message_type)]
 
 
 def _unpacker(form: MessageField, vector_of: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -256,10 +256,6 @@ def _unpacker(form: MessageField, vector_of: Callable[[Any], Any]) -> Callable[[
     if not form.optional:
         return present
     return lambda parsed: present(parsed) if parsed.HasField(name) else None
-
-
-def _vector(values: Any) -> Floats:
-    return np.fromiter(values, np.float64, len(values))
 
 
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:

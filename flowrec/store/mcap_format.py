@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import io
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -115,6 +115,7 @@ class Summary:
     """The summary section of a file.
 
     The `message_index_offsets` of a chunk tell which channels are in it; the offsets themselves are not kept.
+    `file_bytes`: size of the file that it was read from, 0 for one that still grows.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -123,6 +124,7 @@ class Summary:
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
+    file_bytes: int = 0
 
     def enter(self, record: Schema | Channel | Metadata | Attachment, offset: int, length: int) -> None:
         """Enter a record outside the chunks, which stands at a place in the file.
@@ -135,6 +137,11 @@ class Summary:
             times, size = (record.log_time, record.create_time), len(record.data)
             self.attachments.append(AttachmentIndex(offset, length, *times, size, record.name, record.media_type))
         else:
+            self.declare((record,))
+
+    def declare(self, records: Iterable[Schema | Channel]) -> None:
+        """Enter schemas and channels. Raises ValueError: two that differ have the same number."""
+        for record in records:
             known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
             if known.setdefault(record.id, record) != record:
                 raise ValueError(f"{type(record).__name__.lower()} {record.id} is declared twice, differently")
@@ -179,6 +186,7 @@ def parse_summary(data: bytes, data_end: int, chunks: Sequence[ChunkIndex] = ())
     """
     summary = Summary(chunks=list(chunks))
     interned: dict[tuple[bytes, bytes], dict[int, int]] = {}
+    declarations: list[Schema | Channel] = []
     listed_bytes = declared = 0
     for opcode, at, length in records_in(data):
         if opcode == Opcode.CHUNK_INDEX:
@@ -194,13 +202,14 @@ def parse_summary(data: bytes, data_end: int, chunks: Sequence[ChunkIndex] = ())
             raise ValueError(f"more than {DECLARED_LIMIT} records besides chunks")
         body = data[at : at + length]
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            summary.enter(_declaration(opcode, body), at, length)
+            declarations.append(_declaration(opcode, body))
         elif opcode == Opcode.ATTACHMENT_INDEX:
             summary.attachments.append(AttachmentIndex.read(stream_of(body)))
         elif opcode == Opcode.METADATA_INDEX:
             summary.metadata.append(MetadataIndex.read(stream_of(body)))
         elif opcode == Opcode.STATISTICS:
             summary.statistics = Statistics.read(stream_of(body))
+    summary.declare(declarations)
     _check_places(summary, data_end)
     _check_counts(summary)
     return summary

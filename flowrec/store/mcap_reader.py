@@ -166,8 +166,10 @@ class McapReader(Closing):
         """The summary section, checksum verified; nothing in it lies outside the file or over something else."""
         if self._summary is not None:
             found, self._summary = self._summary, None  # once, because who asks changes it
-            return found
-        return self._long_summary(*self._footer())
+        else:
+            found = self._long_summary(*self._footer())
+        found.file_bytes = self.size
+        return found
 
     def lookup_agrees(self) -> bool:
         """False if the lookup record repeats something else than what other programs read."""

@@ -290,7 +290,7 @@ class SessionReader(Closing):
         if file is None:
             if self._closed:
                 raise SessionError(f"{self.path}: has been closed; open the session again")
-            file = FileReader(self.files[number], self._cache)
+            file = FileReader(self.files[number], self._cache, None if number else self._run.first_index)
             if number and not file.header.is_same_run(self.header):
                 raise SessionError(
                     f"{file.source.path}: has another head than {self.files[0].name}, so it is not of the same run;"

@@ -20,7 +20,7 @@ from typing import Self
 
 from flowrec.core import MCAP, Outcome, Output, SessionError, is_growing, name_taken, seconds, shell_word
 from flowrec.store.byte_source import is_there, open_bytes
-from flowrec.store.mcap_format import UnfinishedError
+from flowrec.store.mcap_format import Summary, UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata, is_count
 from flowrec.store.session_path import UrlPath, session_path
 
@@ -176,20 +176,24 @@ class Run:
 
     Attributes
     ----------
+    first_index : summary of the first file, for who reads it next.
     first_ns, last_ns : stamps of the first and the last tick, 0 where there is none.
     """
 
     path: Path
     files: Sequence[RunFile]
+    first_index: Summary | None = None
 
     @classmethod
     def at(cls, path: Path) -> Self:
         """Run of the files that `path` names; SessionError as `files_of` and `check_continuity`."""
-        found = []
+        found: list[RunFile] = []
+        indexes: list[Summary] = []
         for path_of_file in files_of(path):
             with SessionMetadata(path_of_file) as file:
                 found.append(RunFile.of(file))
-        run = cls(path, found)
+                indexes = indexes or [file.index]
+        run = cls(path, found, *indexes)
         if run.in_parts:
             check_continuity(path, found)
         return run

@@ -105,7 +105,7 @@ class Session(Closing):
     @cached_property
     def header(self) -> SessionHeader:
         """Configuration, chip, provenance and parent as they were written before the first message."""
-        with SessionMetadata(self.run.files[0].path) as head:
+        with SessionMetadata(self.run.files[0].path, self.run.first_index) as head:
             return head.header
 
     @property

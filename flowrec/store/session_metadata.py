@@ -169,11 +169,12 @@ class SessionMetadata(Closing):
     Parameters
     ----------
     path : the file.
-    summary : an index to be used instead of the file's own (scan.py makes one).
+    summary : an index to be used instead of the file's own: scan.py makes one, another reader of the file has one.
 
     Attributes
     ----------
     source : the file.
+    index : its summary, with the times on the session clock.
     chunks : where the messages are.
     statistics : how many there are.
     outcome : how the run ended.
@@ -198,7 +199,9 @@ class SessionMetadata(Closing):
                 f"{path}: is an MCAP file of another program (profile {header.profile!r}, library {header.library!r});"
                 " flowrec reads what `flowrec record` has written"
             )
-        found = summary if summary is not None else self.source.read_summary()
+        if summary is not None and summary.file_bytes not in (0, self.source.size):
+            raise SessionError(f"{path}: has changed since it was opened; open the session again")
+        self.index = found = summary or self.source.read_summary()
         self.channels, self.schemas, self.chunks = found.channels, found.schemas, found.chunks
         self.attachments, self.metadata = found.attachments, found.metadata
         records = self._records()
@@ -216,7 +219,7 @@ class SessionMetadata(Closing):
             for index in self.attachments:
                 if index.name == CONFIG_FILE:
                     self.source.set_start(index.log_time)
-            if summary is None:  # what scan.py has made is on the session clock
+            if summary is None:  # one that is given is on the session clock
                 found.to_session_clock(self.source.start_unix_ns)
         assert found.statistics is not None  # McapReader or scan.py has checked it
         self.statistics: Statistics = found.statistics

@@ -23,6 +23,7 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
+import flowrec
 from flowrec.core import Currents, SessionError
 from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, merged_chunks, session_metadata
 from flowrec.store.mcap_writer import McapWriter, new_mcap
@@ -269,6 +270,17 @@ def test_a_closed_reader_says_so(session):
     reader.close()
     with pytest.raises(SessionError, match="has been closed"):
         next(reader.ticks())
+
+
+def test_a_file_that_another_has_replaced_since_it_was_opened_is_told_as_such(session, tmp_path):
+    path = tmp_path / "session.mcap"
+    path.write_bytes(session.read_bytes())
+    opened = flowrec.open(path)
+    write_session(tmp_path / "longer.mcap", list(ticks_of(60, shape=(8, 8)))).replace(path)
+    with pytest.raises(SessionError, match="has changed since it was opened") as error:
+        next(iter(opened.ticks()))
+    assert str(path) in one_line(error)
+    assert sum(1 for _ in flowrec.open(path).ticks()) == 60
 
 
 def test_reading_can_be_broken_off_and_begun_again(session):
