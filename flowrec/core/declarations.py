@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from flowrec.core.enums import WorkOrder
 from flowrec.core.errors import NotFiniteError
-from flowrec.core.units import seconds
+from flowrec.core.units import NS_PER_S, seconds
 
 Result = TypeVar("Result")
 
@@ -194,33 +194,35 @@ class Message:
     stamp_ns: int
 
     def __post_init__(self) -> None:
-        for name, dtype in array_fields(type(self)):
-            given = getattr(self, name)
-            if given is None:
+        for name, dtype, must_be_finite in _checked_fields(type(self)):
+            value = getattr(self, name)
+            if value is None:
                 continue
-            array = np.ascontiguousarray(given, dtype)
-            if array.flags.writeable:
-                array = array.view()
-                array.flags.writeable = False
-            object.__setattr__(self, name, array)
-        if not _READING.depth:
-            self.refuse_not_finite()
-
-    def refuse_not_finite(self) -> None:
-        """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
-        for name in _finite_fields(type(self)):
-            value = getattr(self, name)  # looked at here: a function would be called for each of some hundred a tick
-            if isinstance(value, np.ndarray):
-                few = value.size <= _FEW
-                finite = all(map(math.isfinite, value.ravel().tolist())) if few else bool(np.isfinite(value).all())
+            if dtype is not None:
+                value = np.ascontiguousarray(value, dtype)
+                if value.flags.writeable:
+                    value = value.view()
+                    value.flags.writeable = False
+                object.__setattr__(self, name, value)
+            if not must_be_finite or _READING.depth:
+                continue
+            # Looked at here: a function would be called for each of some hundred numbers a tick.
+            if dtype is None:
+                finite = math.isfinite(value)
+            elif value.size <= _FEW:
+                finite = all(map(math.isfinite, value.ravel().tolist()))
             else:
-                finite = value is None or math.isfinite(value)
+                finite = bool(np.isfinite(value).all())
             if not finite:
                 raise NotFiniteError(_refusal(self))
 
+    def refuse_not_finite(self) -> None:
+        """Raise NotFiniteError as a new message would; one that was read from a file may hold any number."""
+        self.__post_init__()
+
     def since_s(self, earlier: Message | None) -> float:
         """Time in s from the stamp of an earlier record to that of this one; 0 where there is none."""
-        return 0.0 if earlier is None else seconds(self.stamp_ns - earlier.stamp_ns)
+        return 0.0 if earlier is None else (self.stamp_ns - earlier.stamp_ns) / NS_PER_S
 
     def same_as(self, other: object) -> bool:
         """True if the other record is the same bit for bit (NaN equals NaN)."""
@@ -237,9 +239,10 @@ class Message:
 
 
 @_keep
-def _finite_fields(message_type: type) -> tuple[str, ...]:
-    """Names of the fields whose numbers may be NaN or infinite by their type only."""
-    return tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
+def _checked_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any] | None, bool], ...]:
+    """Name, dtype of an array, and whether its numbers must be finite, of each field of arrays or of finite numbers."""
+    found = ((each.name, each.dtype, each.is_float and each.finite) for each in message_fields(message_type))
+    return tuple((name, dtype, finite) for name, dtype, finite in found if dtype is not None or finite)
 
 
 def _refusal(message: Message) -> str:

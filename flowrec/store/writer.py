@@ -26,7 +26,7 @@ from flowrec.core import (
     shape_error,
 )
 from flowrec.store.channels import FRAME_PATH, message_codec
-from flowrec.store.codec import codec_of, encode_record
+from flowrec.store.codec import encode_record
 from flowrec.store.recorder_process import RecorderProcess, RecorderThread
 from flowrec.store.ring_buffer import SnapshotTrigger
 from flowrec.store.roi import WindowSelector
@@ -89,7 +89,8 @@ class SessionWriter:
         self._last_ns = -1
         self._closed = self._told = False
         self._extra = NO_EXTRA
-        self._extra_codecs = {topic.path: message_codec(topic.type, path=topic.path) for topic in options.topics.extra}
+        encoded = (topic for topic in options.topics.topics if topic.type is not Frame)
+        self._codecs = {topic.field: message_codec(topic.type, path=topic.path) for topic in encoded}
         self._start_unix_ns = header.start_unix_ns
         self._trigger = SnapshotTrigger(options.files) if isinstance(options.files, Snapshot) else None
         self._left_out = [topic.field for topic in options.topics.topics if topic.path in options.left_out_topics]
@@ -283,8 +284,7 @@ class SessionWriter:
                 encoded[field] = message
                 continue
             try:
-                codec = self._extra_codecs.get(field) or codec_of(type(message))
-                encoded[field] = encode_record(message, codec, self._start_unix_ns)
+                encoded[field] = encode_record(message, self._codecs[field], self._start_unix_ns)
             except SessionError as error:
                 raise SessionError(f"{self.path}: {error}; what was recorded before it is kept") from error
         return encoded

@@ -99,7 +99,7 @@ class Health(Message):
     @property
     def alarms(self) -> list[str]:
         """The words of the alarm."""
-        return [word for word in self.alarm.split("; ") if word]
+        return self.alarm.split("; ") if self.alarm else []
 
 
 WALLS = "/robots/walls"  # path of the topic

@@ -30,25 +30,36 @@ _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
 
 
 @compiled
-def _draw(
+def _draw(scene: Floats32, discs: Floats, lit_x: float, lit_y: float) -> Ints:
+    """Multiply the light of n defocused discs into the scene; returns the touched windows (n, 4), x0, y0, x1, y1.
+
+    `discs` (n, 7), lengths in pixels: column, row, radius, softness `edge` of its outline, outside of which is a bright
+    rim and a faint dark ring, darkness, and the way `smear` in columns and rows that it goes during the exposure. `lit`
+    is the direction from which oblique light comes (0: from above).
+    """
+    windows = np.empty((len(discs), 4), np.int64)
+    for n in range(len(discs)):
+        column, row, radius, edge, darkness = discs[n, 0], discs[n, 1], discs[n, 2], discs[n, 3], discs[n, 4]
+        found = _draw_one(scene, column, row, radius, edge, darkness, discs[n, 5], discs[n, 6], lit_x, lit_y)
+        windows[n, 0], windows[n, 1], windows[n, 2], windows[n, 3] = found
+    return windows
+
+
+@compiled
+def _draw_one(
     scene: Floats32,
     column: float,
     row: float,
     radius: float,
     edge: float,
     darkness: float,
-    rim: float,
     smear_x: float,
     smear_y: float,
     lit_x: float,
     lit_y: float,
 ) -> tuple[int, int, int, int]:
-    """Multiply the light of a defocused disc into the scene; returns the touched window x0, y0, x1, y1.
-
-    All lengths in pixels. `edge` is the softness of its outline; outside it a bright rim and a faint dark ring.
-    `smear` is the way it goes during the exposure, `lit` the direction from which oblique light comes (0: from above).
-    """
     height, width = scene.shape
+    rim = 0.35 * darkness
     reach = radius + 9.0 * edge + 0.5 * max(abs(smear_x), abs(smear_y))
     x0, x1 = max(math.floor(column - reach), 0), min(math.ceil(column + reach) + 1, width)
     y0, y1 = max(math.floor(row - reach), 0), min(math.ceil(row + reach) + 1, height)
@@ -156,7 +167,8 @@ class Microscope:
 
     def add_still(self, point_um: Floats, radius_um: float, darkness: float) -> None:
         """Put a particle that never moves into the background."""
-        self._particle(self._empty, self._calibration.to_px(point_um).tolist(), radius_um, darkness)
+        still = self._discs(point_um[None], np.array([radius_um]), np.array([darkness]), np.zeros((1, 2)))
+        _draw(self._empty, still, *self._lit)
         self._scene[:] = self._empty
 
     def image(
@@ -167,19 +179,18 @@ class Microscope:
         `stage_um` (2,) is how far the stage, and all that is on it, has moved; None: not at all. Where two lie over
         each other the light is that through both.
         """
-        to_px, off_um = self._calibration.to_px, np.zeros(2)
+        off_um = np.zeros(2)
         if stage_um is not None:
             off_um, shift = stage_um, self._calibration.vectors_to_px(stage_um)
             move = np.column_stack((np.eye(2), shift))
             size = self._scene.shape[::-1]
             cv2.warpAffine(self._empty, move, size, dst=self._scene, borderMode=cv2.BORDER_REPLICATE)
-        places = to_px(particles.points_um + off_um).tolist()
-        looks = zip(places, particles.radii_um.tolist(), particles.darkness.tolist(), strict=True)
-        windows = [self._particle(self._scene, *each) for each in looks]
-        for each in robots:
-            place = to_px(each.position_um + off_um).tolist()
-            smear = self._calibration.vectors_to_px(each.velocity_um_s * self._camera.exposure_s).tolist()
-            windows.append(self._particle(self._scene, place, each.radius_um, each.darkness, smear))
+        points_um = np.vstack((particles.points_um, *(each.position_um for each in robots))) + off_um
+        radii_um = np.append(particles.radii_um, [each.radius_um for each in robots])
+        darkness = np.append(particles.darkness, [each.darkness for each in robots])
+        velocity_um_s = np.vstack((np.zeros_like(particles.points_um), *(each.velocity_um_s for each in robots)))
+        discs = self._discs(points_um, radii_um, darkness, velocity_um_s * self._camera.exposure_s)
+        windows = _draw(self._scene, discs, *self._lit).tolist()
         height, width = self._scene.shape
         camera = self._camera
         image = np.empty((height, width), pixel_type(camera.bits))
@@ -190,18 +201,12 @@ class Microscope:
             self._scene[y0:y1, x0:x1] = self._empty[y0:y1, x0:x1]
         return image
 
-    def _particle(
-        self,
-        scene: Floats32,
-        place_px: Sequence[float],
-        radius_um: float,
-        darkness: float,
-        smear_px: Sequence[float] = (0.0, 0.0),
-    ) -> tuple[int, int, int, int]:
-        radius = radius_um / self._calibration.um_per_px
-        edge = math.hypot(max(self._image.blur_px, 0.3), 0.05 * radius)
-        (column, row), (smear_x, smear_y) = place_px, smear_px
-        return _draw(scene, column, row, radius, edge, darkness, 0.35 * darkness, smear_x, smear_y, *self._lit)
+    def _discs(self, points_um: Floats, radii_um: Floats, darkness: Floats, smear_um: Floats) -> Floats:
+        """The rows (n, 7) that `_draw` takes."""
+        to_px, blur_px = self._calibration.vectors_to_px, max(self._image.blur_px, 0.3)
+        radii_px = radii_um / self._calibration.um_per_px
+        edges_px = [math.hypot(blur_px, 0.05 * each) for each in radii_px.tolist()]
+        return np.column_stack((self._calibration.to_px(points_um), radii_px, edges_px, darkness, to_px(smear_um)))
 
 
 def _empty_scene(
