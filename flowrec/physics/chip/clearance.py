@@ -64,15 +64,18 @@ def opening_point_um(chip: Chip, name: str, depth_um: float) -> tuple[float, flo
     opening = named_opening(chip, name)
     side = np.zeros_like(chip.mask)
     border(side, opening.side)[opening.first : opening.last + 1] = True
-    front = reached = side & chip.mask
-    for _ in range(max(1, round(depth_um / chip.um_per_px))):
-        grown = scipy.ndimage.binary_dilation(reached) & chip.mask
+    steps = max(1, round(depth_um / chip.um_per_px))
+    rows, columns = (slice(max(at.min() - steps, 0), at.max() + steps + 1) for at in np.nonzero(side))
+    mask = chip.mask[rows, columns]  # what so many steps can reach
+    front = reached = side[rows, columns] & mask
+    for _ in range(steps):
+        grown = scipy.ndimage.binary_dilation(reached) & mask
         if not (grown & ~reached).any():
             break
         front, reached = grown & ~reached, grown
-    to_wall = clearance_um(chip.mask, chip.um_per_px)
-    row, column = np.unravel_index(np.argmax(np.where(front, to_wall, -np.inf)), chip.mask.shape)
-    return float(column * chip.um_per_px), float(row * chip.um_per_px)
+    to_wall = clearance_um(chip.mask, chip.um_per_px)[rows, columns]
+    row, column = np.unravel_index(np.argmax(np.where(front, to_wall, -np.inf)), mask.shape)
+    return float((columns.start + column) * chip.um_per_px), float((rows.start + row) * chip.um_per_px)
 
 
 def nearest_fluid(chip: Chip, point_um: ArrayLike, clearance: float = 0.0) -> Floats | None:

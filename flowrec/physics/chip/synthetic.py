@@ -9,6 +9,7 @@ is on top or below. The inlet speed is such that a robot of 600 um/s can hold it
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 
@@ -24,6 +25,7 @@ _UM_PER_PX = 20.0
 _HEIGHT, _WIDTH = 256, 320  # of the vessels
 _ROWS, _COLUMNS = 3, 4  # of their junctions
 _PEAK_UM_S = 400.0  # in the fastest branch, by the resistance network; bends and junctions add to it
+_KEPT = 8  # networks, whose drawing takes a tenth of a second
 _Edge = tuple[int, int]
 
 
@@ -65,6 +67,7 @@ def straight() -> Chip:
     return _chip("straight", mask, 200.0)
 
 
+@functools.cache
 def bifurcation() -> Chip:
     """6.4 x 5.12 mm: the inlet on the left splits into a short fast and a long slow branch that meet again.
 
@@ -85,6 +88,7 @@ def bifurcation() -> Chip:
     return _chip("bifurcation", gap <= 0, 220.0)
 
 
+@functools.lru_cache(_KEPT)
 def vessels(seed: int) -> Chip:
     """The chip of a seed, (256, 320) pixels of 20 um, channels 0.16 to 0.4 mm wide."""
     rng = np.random.default_rng([seed, 0x7E55E1] if seed >= 0 else [-seed, 1, 0x7E55E1])
