@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 
-from flowrec.core import Phase, UnreachableError, UsageError, nearest_pixel
+from flowrec.core import Phase, UnreachableError, UsageError, faults, nearest_pixel
 from flowrec.physics import (
     USUAL_DELAY_S,
     Calibration,
@@ -63,6 +63,8 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     refuse_unseen(config)
     _refuse_survey_share(config)
     robot, camera = _fit_to_chip(config, chip)
+    for fault in (*faults(robot, "robot."), *faults(camera, "camera.")):  # else the session could not be read again
+        raise UsageError(f"{fault}; it follows from other settings of robot, camera, coils and chip: correct those")
     swift = {"frame_s": round(1.0 / camera.rate_hz, 6), "latency_s": robot.delay_s}
     plan = replace(config.plan, swift=_with_times(config.plan.swift, swift))
     if plan.wall_error_um is None:
