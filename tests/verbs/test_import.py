@@ -325,7 +325,7 @@ def test_walls_that_are_not_where_the_registration_says_are_told_before_the_impo
 @pytest.mark.parametrize(
     ("share", "way"),
     [
-        (-0.05, "small"),
+        pytest.param(-0.05, "small", marks=pytest.mark.slow("imports a movie; what is measured: the walls' own test")),
         pytest.param(0.0, "", marks=pytest.mark.slow("imports a movie of the right scale")),
         pytest.param(0.05, "large", marks=pytest.mark.slow("imports a movie, to the other side")),
     ],
