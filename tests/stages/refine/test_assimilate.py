@@ -258,20 +258,20 @@ def test_few_or_odd_observations_never_make_the_field_worse(twin, which):
     assert which != "huge std" or "nothing about inlet 0" in refined.note
 
 
-@pytest.mark.parametrize("width", [8, 32])
+@pytest.mark.parametrize("width", [8, 32])  # of the lower inlet, with as much inflow
 def test_the_note_says_that_only_two_inlets_together_are_seen(width):
     mask = np.zeros((30, 60), bool)
     mask[11:19, 20:] = True
     mask[:19, 20:28] = mask[11:, 20 : 20 + width] = True
     openings = (
         Opening("top", 20, 27, "inlet", 100.0),
-        Opening("bottom", 20, 19 + width, "inlet", 100.0),
+        Opening("bottom", 20, 19 + width, "inlet", 800.0 / width),
         Opening("right", 11, 18, "outlet", 0.0),
     )
     chip = Chip("tee", mask, 10.0, openings, 1.0, 1000.0, walls="pixel")
     solver = FlowSolver()
-    assumed, true = solver.solve(chip), solver.solve(chip.with_boundary([130.0, 110.0, 0.0]))
-    points = np.column_stack([np.arange(400.0, 550.0, 20.0), np.full(8, 145.0)])
+    assumed, true = solver.solve(chip), solver.solve(chip.with_boundary([130.0, 880.0 / width, 0.0]))
+    points = np.column_stack([np.linspace(540.0, 590.0, 8), np.full(8, 145.0)])
     observed = Observations(0, points, sample(true, points), np.full(8, 2.0))
     note = Refiner().refine(assumed, observed, chip, solver).note
     assert "of inlet 0 (top) and inlet 1 (bottom) they see only the flow together" in note
