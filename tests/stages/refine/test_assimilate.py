@@ -11,7 +11,8 @@ from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.flow.linear_solver import clear_cache
 from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.refine import Assimilate, Refiner, assimilate, causes
+from flowrec.physics.flow.uncertainty import Doubts
+from flowrec.stages.refine import Assimilate, Refiner, assimilate, causes, uncertainty
 from flowrec.stages.refine.assimilate import Hypotheses
 from flowrec.stages.refine.discretisation_error import ModelError
 from flowrec.stages.refine.field_variance import field_columns, prior_left_variance, prior_of
@@ -352,13 +353,16 @@ def test_what_the_observations_can_not_tell_is_within_the_bars_of_the_map_and_of
         first += len(effect.columns)
     other = replace(best, flow=best.flow + 10.0, posterior=replace(best.posterior, mean=mean))
     problem = RefinementProblem(case.assumed, operator, case.chip, case.solver, assimilated=None)
-    fields = []
+    monkeypatch.setattr(uncertainty, "doubted_places", lambda *_: Doubts.none(len(best.flow)))
+    fields, unsure = [], []
     for weights in (np.array([1.0, 0.0]), np.array([0.5, 0.5])):
         every = Hypotheses([best, other], weights, np.array([1.0, 0.0]), case.chip.mask)
         monkeypatch.setattr(Assimilate, "hypotheses", lambda *_, every=every: every)
         fields.append(Assimilate().fit(problem))
+        unsure.append(Refiner().uncertainty(case.assumed, case.observations, case.chip, case.solver).std_um_s)
     sure, torn = (field.std_um_s[case.chip.mask].astype(float) for field in fields)
     np.testing.assert_allclose(torn**2 - sure**2, 0.5 * 10.0**2, rtol=1e-3)
+    np.testing.assert_allclose(unsure[1] ** 2 - unsure[0] ** 2, 0.5 * 10.0**2, rtol=1e-3)
     (value, std), (other_value, wider) = (
         findings([best, other], weights).of("um_per_px_share")
         for weights in (np.array([1.0, 0.0]), np.array([0.5, 0.5]))

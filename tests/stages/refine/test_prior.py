@@ -10,7 +10,9 @@ from flowrec.core.messages import Observations
 from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.chip.fluid import CarreauYasuda, PowerLaw
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.refine import Refiner
+from flowrec.stages.refine import Assimilate, Refiner
+from flowrec.stages.refine.discretisation_error import ModelError
+from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.hypothesis import HypothesisFit
 from flowrec.stages.refine.prior import Prior, PriorSettings
 
@@ -121,6 +123,13 @@ def test_a_chip_without_a_depth_has_no_unknown_of_its_depth(driven):
     solver = FlowSolver(convection=False)
     modes = solver.sensitivities(driven, friction=True).modes
     assert len(modes) == len(Prior.of(replace(SETTINGS, depth_std_share=0.1), driven, 0.01).effect[0])
+
+
+def test_the_doubt_about_the_error_of_the_grid_is_an_unknown_of_the_size_that_is_set(driven):
+    solver = FlowSolver(k=2, convection=False)
+    once, twice = (flow_model(Assimilate(), ModelError(share_std=std), driven, solver).known[-1] for std in (0.1, 0.2))
+    assert np.abs(once).max() > 0.0
+    np.testing.assert_array_equal(twice, 2.0 * once)
 
 
 def test_a_parameter_that_enters_a_law_by_its_logarithm_has_the_error_of_its_logarithm_times_itself(driven):
