@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from flowrec.physics import Opening
 from flowrec.stages import Planner, open_space
-from flowrec.stages.planning.free_space import FastFlowMargin
+from flowrec.stages.planning.feasibility import swept_out
+from flowrec.stages.planning.free_space import CourseError, FastFlowMargin
 from flowrec.stages.planning.problem import attach_goal, attach_start
 from tests.stages.planning.worlds import PX, channel, chip_of, downstream, field_of, poiseuille, robot
 
@@ -29,6 +31,20 @@ def test_a_route_keeps_as_far_from_walls_as_the_robot_may_drift():
     assert calm.free.sum() > fast.free.sum() > 0
     assert (fast.clearance[fast.free] * PX >= need_um).all()
     assert lowest_um(Planner(swift=FAST).plan(field, *ends, chip, robot())) >= need_um
+
+
+@pytest.mark.parametrize(("flow_um_s", "swept_um"), [(100.0, 45.0), (400.0, 280.0)])
+def test_a_robot_that_starts_where_the_flow_takes_it_out_before_the_coils_are_up_is_told_how_far(flow_um_s, swept_um):
+    mask = np.ones((30, 100), bool)
+    field, chip = field_of(mask, flow_um_s), chip_of(mask, [Opening("right", 0, 29, "outlet", 0.0)])
+    error = CourseError(blind_s=0.2, speed_um_s=200.0, radius_um=20.0)
+    edge_um = chip.size_um[0] - 0.5 * PX
+
+    def told(left_um):
+        return swept_out(chip, field, np.array([edge_um - left_um, 220.0]), error, 1.0)
+
+    assert f"carries the robot {swept_um:.0f} um before" in told(swept_um + 15.0)
+    assert told(swept_um + 25.0) == ""
 
 
 @pytest.mark.parametrize("method", ["time_field", "astar_time", "astar_length"])
