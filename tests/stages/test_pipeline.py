@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import Action, Hand, OperatorEvent, Outcome, Phase
+from flowrec.core import Action, Applied, Hand, OperatorEvent, Outcome, Phase, Tick, Truth
 from flowrec.physics import ROLLING_BY_DRAG, ChipSettings, clearance_um, load_chip, sample
 from flowrec.stages import Inputs, assemble, step
+from flowrec.stages.inputs import with_inputs
 from flowrec.stages.pipeline import _goal_fault
 
 
@@ -245,3 +246,11 @@ def test_a_goal_may_lie_up_to_the_edge_of_the_first_and_the_last_pixel_of_a_chip
     last = chip.mask.shape[1] - 1
     assert [fault(column) for column in (-0.4, last + 0.4)] == ["", ""]
     assert [fault(column) for column in (-0.6, last + 0.6)] == ["it is outside the chip"] * 2
+
+
+def test_a_truth_that_is_not_new_on_a_tick_is_not_on_it_and_what_the_coils_did_stays_known():
+    here = np.zeros(2)
+    applied = Applied(0, 1.0, 0.0, 4.0, np.zeros(3), here)
+    last = Tick(0, applied=applied, truth=Truth(0, here, here, 40.0, 0))
+    now = with_inputs(last, Inputs(33, None, None))
+    assert now.truth is None and now.applied is applied and now.stamp_ns == 33
