@@ -59,6 +59,9 @@ def test_where_the_drift_fills_the_channel_the_place_and_the_reason_are_named(me
     assert not route.reachable and "too swift to be steered at" in route.reason
     x_um = float(route.reason.split("at ")[1].split(",")[0])
     assert 500.0 < x_um < 600.0
+    # 0.2 x 2500 x 0.1 um for the map, 0.1 x 600 x 0.1 for the heading, (0.05 x 3100)^2 / 160 for the bend.
+    assert "in a flow of 2500 um/s and with 600 um/s of its own the robot may be 206 um off" in route.reason
+    assert "the walls leave 105 um" in route.reason  # 115 from the middle pixel to the wall, less the radius
     assert Planner(method=method).plan(field, *ends, chip, robot(600.0)).reachable, (
         "times that nobody set count for nothing"
     )
