@@ -16,8 +16,8 @@ import pytest
 import flowrec
 from flowrec.core import UsageError
 from flowrec.measure import registration_state
-from flowrec.measure.calibrate_image import fragment, settings_of
-from flowrec.physics import Calibration
+from flowrec.measure.calibrate_image import fragment, settings_of, walls_state
+from flowrec.physics import Calibration, ChipSettings, load_chip
 from flowrec.stages import CameraSettings, load_config, with_sets
 from flowrec.stages.config import registration_of
 from flowrec.verbs.record import record
@@ -118,6 +118,7 @@ def test_the_settings_of_a_pose_put_each_pixel_where_the_pose_has_it(size_px, an
     again = registration_of(camera, SimpleNamespace(size_um=(1000.0, 800.0), um_per_px=20.0))  # type: ignore[arg-type]
     places_px = np.array([[0.0, 0.0], [79.0, 0.0], [0.0, 63.0], [31.5, 20.25]])
     np.testing.assert_allclose(again.to_um(places_px), pose.to_um(places_px), atol=0.01)
+    assert -180.0 <= sets["angle_deg"] < 180.0
 
 
 @pytest.mark.slow("searches a picture twice, for every angle and mirrored")
@@ -133,3 +134,13 @@ def test_several_poses_are_listed_and_nothing_is_written(tmp_path):
     assert not list(tmp_path.glob("out*"))
     done = invoke(*words, "-o", tmp_path / "out.toml", "--pick", "1")
     assert done.exit_code == 0 and {file.name for file in tmp_path.glob("out*")} == {"out.toml", "out.png"}
+
+
+@pytest.mark.parametrize(("stated", "said"), [(10.0, "16.7 % too small"), (15.0, "25.0 % too large")])
+def test_a_scale_that_the_walls_contradict_is_said_on_the_right_side_with_the_one_to_set(stated, said, monkeypatch):
+    fit = SimpleNamespace(calibration=Calibration(12.0), std=np.array([0.1, 0.1, 0.01, 0.001]))
+    monkeypatch.setitem(walls_state.__globals__, "fit_nearby", lambda *_: fit)
+    seen = walls_state(np.full((4, 4), int(stated), np.uint8), load_chip(ChipSettings()), Calibration(stated))
+    assert seen is not None and seen.other_scale and not seen.good
+    assert f"camera.um_per_px = {stated:g} is {said} for the walls in the image" in seen.text
+    assert "at 12 ± 0.01: set camera.um_per_px = 12," in seen.text
