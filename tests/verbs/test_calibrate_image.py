@@ -15,7 +15,7 @@ import pytest
 
 import flowrec
 from flowrec.core import UsageError
-from flowrec.measure import registration_state
+from flowrec.measure import registration_state, write_picture
 from flowrec.measure.calibrate_image import fragment, settings_of, walls_state
 from flowrec.physics import Calibration, ChipSettings, load_chip
 from flowrec.stages import CameraSettings, load_config, with_sets
@@ -144,3 +144,12 @@ def test_a_scale_that_the_walls_contradict_is_said_on_the_right_side_with_the_on
     assert seen is not None and seen.other_scale and not seen.good
     assert f"camera.um_per_px = {stated:g} is {said} for the walls in the image" in seen.text
     assert "at 12 ± 0.01: set camera.um_per_px = 12," in seen.text
+
+
+def test_a_picture_is_written_once_and_another_one_beside_it(tmp_path):
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    first = write_picture(grey, tmp_path / "lab.png")
+    assert write_picture(grey, tmp_path / "lab.png") == first == tmp_path / "lab.png"
+    other = write_picture(grey + 1, tmp_path / "lab.png")
+    assert other.name == "lab_2.png" and write_picture(grey + 1, tmp_path / "lab.png") == other
+    assert np.array_equal(cv2.imread(str(first), cv2.IMREAD_GRAYSCALE), grey)
