@@ -17,6 +17,7 @@ import flowrec
 from flowrec.core import UsageError
 from flowrec.measure import registration_state, write_picture
 from flowrec.measure.calibrate_image import fragment, settings_of, walls_state
+from flowrec.measure.images import read_picture
 from flowrec.physics import Calibration, ChipSettings, load_chip
 from flowrec.stages import CameraSettings, load_config, with_sets
 from flowrec.stages.config import registration_of
@@ -153,3 +154,17 @@ def test_a_picture_is_written_once_and_another_one_beside_it(tmp_path):
     other = write_picture(grey + 1, tmp_path / "lab.png")
     assert other.name == "lab_2.png" and write_picture(grey + 1, tmp_path / "lab.png") == other
     assert np.array_equal(cv2.imread(str(first), cv2.IMREAD_GRAYSCALE), grey)
+
+
+def test_the_picture_of_a_session_is_the_median_of_images_from_its_beginning_to_its_end(tmp_path, monkeypatch):
+    def at(time_s):
+        image = np.full((8, 100), 120, np.uint8)
+        image[:, round(9.9 * time_s)] = 10  # what moves
+        return SimpleNamespace(frame=SimpleNamespace(index=round(9.9 * time_s), image=image))
+
+    session = SimpleNamespace(duration_s=10.0, at=at, topics={"/camera/frame": 100})
+    monkeypatch.setitem(read_picture.__globals__, "open_session", lambda _: session)
+    path = tmp_path / "s.mcap"
+    path.write_bytes(b"any")
+    seen = read_picture(path, "grey")
+    assert (seen.image == 120).all() and (seen.covered.done, seen.covered.total) == (31, 100)
