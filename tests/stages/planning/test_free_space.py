@@ -33,6 +33,13 @@ def test_a_route_keeps_as_far_from_walls_as_the_robot_may_drift():
     assert lowest_um(Planner(swift=FAST).plan(field, *ends, chip, robot())) >= need_um
 
 
+def test_a_little_speed_is_left_where_the_flow_may_be_wrong_by_more_than_all_of_it():
+    mask = channel()
+    space = open_space(chip_of(mask), field_of(mask, 60.0), 10.0, 1.0)
+    assert np.unique(space.cost_rasters(10.0, 4.0).speed).tolist() == [6.0]
+    assert np.unique(space.cost_rasters(10.0, 25.0).speed).tolist() == pytest.approx([0.2])
+
+
 @pytest.mark.parametrize(("flow_um_s", "swept_um"), [(100.0, 45.0), (400.0, 280.0)])
 def test_a_robot_that_starts_where_the_flow_takes_it_out_before_the_coils_are_up_is_told_how_far(flow_um_s, swept_um):
     mask = np.ones((30, 100), bool)
