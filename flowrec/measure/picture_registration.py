@@ -32,7 +32,7 @@ _LEAST_FOUND = 0.7  # part of the walls
 _EQUAL_FOUND, _EQUAL_EXPLAINED = 0.1, 0.85  # less found by this, and explained at least by this factor: equally good
 _SAME_PX = 2.0  # two poses that differ by less are one
 _MOST_SHIFT_PX, _MOST_ANGLE_DEG, _MOST_SCALE = 0.5, 0.1, 0.003  # standard errors above which a picture is refused
-_OTHER_SCALE, _SIGNIFICANT = 0.02, 3.0  # relative difference, and standard errors, from which a scale is another one
+_OTHER_SCALE = 0.02  # relative difference from which a scale is another one: over six of the largest standard errors
 # Scales that are tried about an assumed one: a step moves the image's border by 2 of 480 px.
 _NEAR_GROWTHS = (1.0, *np.geomspace(1.0 / 1.2, 1.2, 48).tolist())
 _NEAR_SCALE = 0.012  # relative difference from the assumed scale up to which the fit finds its way
@@ -148,9 +148,9 @@ def moved_px(fit: WallFit, chip: Chip, assumed: Calibration) -> float | None:
 
 
 def other_scale(fit: WallFit, assumed: Calibration) -> float | None:
-    """The um per pixel of a fit, where they contradict the assumed ones by more than 2 % and three standard errors."""
-    apart, std = abs(math.log(fit.calibration.um_per_px / assumed.um_per_px)), float(fit.std[3])
-    contradicts = std < _MOST_SCALE and apart > max(_OTHER_SCALE, _SIGNIFICANT * std)
+    """The um per pixel of a fit that the picture determines, where they differ from the assumed ones by over 2 %."""
+    apart = abs(math.log(fit.calibration.um_per_px / assumed.um_per_px))
+    contradicts = float(fit.std[3]) < _MOST_SCALE and apart > _OTHER_SCALE
     return fit.calibration.um_per_px if contradicts else None
 
 

@@ -17,7 +17,7 @@ import tomli_w
 
 import flowrec
 from flowrec.core import FlowrecError, SessionError, UnreachableError, UsageError
-from flowrec.physics import ChipSettings, load_chip
+from flowrec.physics import ChipSettings, load_chip, median_width_um
 from flowrec.run import refuse_below
 from flowrec.stages import Config, config_from_toml, load_config, to_toml, with_sets
 from flowrec.stages.config import _BEFORE, _MOVED
@@ -182,6 +182,16 @@ def test_a_rig_that_is_not_simulated_needs_its_robot_and_camera_measured() -> No
     robot = replace(config.robot, radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, delay_s=0.04)
     camera = replace(config.camera, um_per_px=10.0, rate_hz=30.0)
     assert asdict(resolve(replace(config, robot=robot, camera=camera), chip).robot) == asdict(robot)
+
+
+def test_a_robot_of_a_coarse_camera_is_assumed_to_be_no_larger_than_a_quarter_of_the_channel() -> None:
+    config = load_config(None, [])
+    chip = load_chip(config.chip)
+    fine, coarse = (
+        resolve(with_sets(config, [f"camera.um_per_px={um:g}"]), chip).robot.radius_um
+        for um in (10.0, 0.2 * median_width_um(chip))
+    )
+    assert fine == 50.0 < coarse == pytest.approx(0.25 * median_width_um(chip), abs=0.01)
 
 
 def test_a_limit_that_the_method_of_the_survey_does_not_read_is_refused_with_those_it_reads() -> None:

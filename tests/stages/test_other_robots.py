@@ -22,6 +22,7 @@ from flowrec.core import (
     RobotWalls,
     Source,
     Tick,
+    Timing,
     Topic,
     Track,
     Truth,
@@ -45,7 +46,7 @@ from flowrec.stages.control.events import event_of
 from flowrec.stages.estimation import Sampler
 from flowrec.stages.other_robots import OtherRobots, as_stated, expected_robots, observe_others
 from flowrec.stages.robot_topics import messages_of, robot_topics
-from flowrec.stages.run_figures import RobotStatistics, RunStatistics
+from flowrec.stages.run_figures import RobotStatistics, RunStatistics, chain_ms
 from tests.short_missions import SMALL
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=28.0)
@@ -342,3 +343,12 @@ def test_the_tracking_error_counts_each_demand_once_and_only_on_the_way_to_the_g
         run.write(Tick(stamp_ns, mission=mission, demand=demand))
     assert run.tracking_error_um == pytest.approx(math.sqrt((9.0 + 16.0) / 2.0))
     assert run.navigating_ns == 1
+
+
+def test_the_latency_adds_up_from_the_exposure_to_the_field_and_what_is_not_told_is_not_known():
+    told = Timing(
+        0, track_ms=10.0, observe_ms=2.0, control_ms=3.0, sinks_ms=50.0, total_ms=70.0, queue_mb=0.0, dropped_frames=0
+    )
+    assert np.isnan(chain_ms(told)).all()
+    known = replace(told, arrival_ms=5.0, wait_ms=1.0, apply_ms=0.5, field_ms=4.0)
+    assert chain_ms(known) == (5.0, 16.0, 20.5, 21.0, 25.0)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import flowrec
-from flowrec.core import Hand, Outcome, Phase
-from flowrec.physics import ROLLING_BY_DRAG, sample
+from flowrec.core import Action, Applied, Hand, OperatorEvent, Outcome, Phase, Tick, Truth
+from flowrec.physics import ROLLING_BY_DRAG, ChipSettings, clearance_um, load_chip, sample
 from flowrec.stages import Inputs, assemble, step
+from flowrec.stages.inputs import with_inputs
+from flowrec.stages.pipeline import _goal_fault
 
 
 @pytest.fixture(scope="module")
@@ -229,3 +232,25 @@ def test_an_observer_that_corrects_the_map_reads_it_where_the_registration_puts_
     assert np.allclose(there.flow_um_s, expected, atol=1.0)
     assert np.hypot(*(there.flow_um_s - stated.flow_um_s)) > 20.0
     assert flow_um_s(across, False).same_as(stated)
+
+
+def test_a_goal_may_lie_up_to_the_edge_of_the_first_and_the_last_pixel_of_a_chip():
+    chip = load_chip(ChipSettings())
+    stages = SimpleNamespace(chip=chip, clearance_um=clearance_um(chip.mask, chip.um_per_px))
+    row = int(np.flatnonzero(chip.mask[:, 0] & chip.mask[:, -1]).mean())
+
+    def fault(column):
+        goal_um = chip.um_per_px * np.array([column, row])
+        return _goal_fault(stages, SimpleNamespace(operator=OperatorEvent(7, Action.GOAL, "", goal_um), stamp_ns=7))
+
+    last = chip.mask.shape[1] - 1
+    assert [fault(column) for column in (-0.4, last + 0.4)] == ["", ""]
+    assert [fault(column) for column in (-0.6, last + 0.6)] == ["it is outside the chip"] * 2
+
+
+def test_a_truth_that_is_not_new_on_a_tick_is_not_on_it_and_what_the_coils_did_stays_known():
+    here = np.zeros(2)
+    applied = Applied(0, 1.0, 0.0, 4.0, np.zeros(3), here)
+    last = Tick(0, applied=applied, truth=Truth(0, here, here, 40.0, 0))
+    now = with_inputs(last, Inputs(33, None, None))
+    assert now.truth is None and now.applied is applied and now.stamp_ns == 33

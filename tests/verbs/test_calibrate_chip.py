@@ -1,5 +1,6 @@
 """From a picture to a chip that can be solved."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import pytest
 
 from flowrec.core import ChipError, FlowrecError, OutputError, UsageError
 from flowrec.measure import outline
-from flowrec.measure.calibrate_chip import calibrate_chip
+from flowrec.measure.calibrate_chip import calibrate_chip, chip_toml
 from flowrec.physics import Calibration, ChipSettings, FlowSolver, load_chip, sample
 from tests.conftest import invoke
 from tests.physics.chip.looks import LOOKS, picture
@@ -88,6 +89,22 @@ def test_a_known_width_moves_the_walls(image):
     assert not (narrower.mask & ~plain.mask).any() and 0.05 < lost / np.count_nonzero(plain.mask) < 0.15
     with pytest.raises(UsageError, match="channels"):
         calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-150.0)
+
+
+def test_the_file_of_a_chip_states_how_large_its_pixels_are_and_the_speed_of_each_inlet(image):
+    plain = calibrate_chip(image, None, UM_PER_PX, walls="dark")
+    narrower = calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-UM_PER_PX, seen=plain)
+    assert [o.width_px - 2 for o in plain.openings] == [o.width_px for o in narrower.openings]
+    inlets = tuple(
+        replace(o, kind="inlet", value=value) for o, value in zip(plain.openings, (50.0, 100.0), strict=True)
+    )
+    done = plain._replace(pixel=2.0, openings=inlets, inlets_known=True, speed_um_s=75.0)
+    lines = chip_toml(done, "mine").splitlines()
+    assert f"um_per_px = {2.0 * UM_PER_PX:.7g}  # a pixel of the mask, 2 pixels of the picture" in lines
+    assert [line for line in lines if line.startswith("speed_um_s")] == [
+        "speed_um_s = 50.0  # mean",
+        "speed_um_s = 100.0  # mean",
+    ]
 
 
 def test_a_refused_picture_leaves_no_file(image, tmp_path):

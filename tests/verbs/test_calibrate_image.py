@@ -15,9 +15,10 @@ import pytest
 
 import flowrec
 from flowrec.core import UsageError
-from flowrec.measure import registration_state
-from flowrec.measure.calibrate_image import fragment, settings_of
-from flowrec.physics import Calibration
+from flowrec.measure import registration_state, write_picture
+from flowrec.measure.calibrate_image import fragment, settings_of, walls_state
+from flowrec.measure.images import read_picture
+from flowrec.physics import Calibration, ChipSettings, load_chip
 from flowrec.stages import CameraSettings, load_config, with_sets
 from flowrec.stages.config import registration_of
 from flowrec.verbs.record import record
@@ -118,6 +119,7 @@ def test_the_settings_of_a_pose_put_each_pixel_where_the_pose_has_it(size_px, an
     again = registration_of(camera, SimpleNamespace(size_um=(1000.0, 800.0), um_per_px=20.0))  # type: ignore[arg-type]
     places_px = np.array([[0.0, 0.0], [79.0, 0.0], [0.0, 63.0], [31.5, 20.25]])
     np.testing.assert_allclose(again.to_um(places_px), pose.to_um(places_px), atol=0.01)
+    assert -180.0 <= sets["angle_deg"] < 180.0
 
 
 @pytest.mark.slow("searches a picture twice, for every angle and mirrored")
@@ -133,3 +135,36 @@ def test_several_poses_are_listed_and_nothing_is_written(tmp_path):
     assert not list(tmp_path.glob("out*"))
     done = invoke(*words, "-o", tmp_path / "out.toml", "--pick", "1")
     assert done.exit_code == 0 and {file.name for file in tmp_path.glob("out*")} == {"out.toml", "out.png"}
+
+
+@pytest.mark.parametrize(("stated", "said"), [(10.0, "16.7 % too small"), (15.0, "25.0 % too large")])
+def test_a_scale_that_the_walls_contradict_is_said_on_the_right_side_with_the_one_to_set(stated, said, monkeypatch):
+    fit = SimpleNamespace(calibration=Calibration(12.0), std=np.array([0.1, 0.1, 0.01, 0.001]))
+    monkeypatch.setitem(walls_state.__globals__, "fit_nearby", lambda *_: fit)
+    seen = walls_state(np.full((4, 4), int(stated), np.uint8), load_chip(ChipSettings()), Calibration(stated))
+    assert seen is not None and seen.other_scale and not seen.good
+    assert f"camera.um_per_px = {stated:g} is {said} for the walls in the image" in seen.text
+    assert "at 12 ± 0.01: set camera.um_per_px = 12," in seen.text
+
+
+def test_a_picture_is_written_once_and_another_one_beside_it(tmp_path):
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    first = write_picture(grey, tmp_path / "lab.png")
+    assert write_picture(grey, tmp_path / "lab.png") == first == tmp_path / "lab.png"
+    other = write_picture(grey + 1, tmp_path / "lab.png")
+    assert other.name == "lab_2.png" and write_picture(grey + 1, tmp_path / "lab.png") == other
+    assert np.array_equal(cv2.imread(str(first), cv2.IMREAD_GRAYSCALE), grey)
+
+
+def test_the_picture_of_a_session_is_the_median_of_images_from_its_beginning_to_its_end(tmp_path, monkeypatch):
+    def at(time_s):
+        image = np.full((8, 100), 120, np.uint8)
+        image[:, round(9.9 * time_s)] = 10  # what moves
+        return SimpleNamespace(frame=SimpleNamespace(index=round(9.9 * time_s), image=image))
+
+    session = SimpleNamespace(duration_s=10.0, at=at, topics={"/camera/frame": 100})
+    monkeypatch.setitem(read_picture.__globals__, "open_session", lambda _: session)
+    path = tmp_path / "s.mcap"
+    path.write_bytes(b"any")
+    seen = read_picture(path, "grey")
+    assert (seen.image == 120).all() and (seen.covered.done, seen.covered.total) == (31, 100)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 import flowrec
 from flowrec.measure import MotionFit
 from flowrec.measure.calibrate_motion import calibrate_motion
-from flowrec.measure.speed_table import fit_speed_table
+from flowrec.measure.speed_table import SpeedTable, fit_speed_table, propose_table
+from flowrec.physics import Robot
 from flowrec.stages import FieldLog, load_config
 from tests.short_missions import SMALL
 
@@ -83,3 +85,16 @@ def test_calibrate_motion_finds_that_a_simulated_robot_is_a_fifth_faster_than_it
     expected = 1.2 * np.interp(hz, *np.array([(0.0, 0.0), *table]).T)
     assert um_s == pytest.approx(expected, rel=0.1)
     assert load_config(out).robot.speed_at_hz == found.sets["robot.speed_at_hz"], "the file is a configuration"
+
+
+def test_a_stated_table_is_replaced_by_the_one_found_and_said_to_be_off_by_the_most_on_the_side_it_is() -> None:
+    table = (5.0, 100.0), (10.0, 150.0)
+    robot = Robot(radius_um=50.0, um_per_rev=20.0, max_speed_um_s=150.0, step_out_hz=10.0, speed_at_hz=table)
+    found = SpeedTable(((5.0, 80.0), (10.0, 165.0)), (1.0, 2.0))
+    sets: dict[str, Any] = {"robot.um_per_rev": 16.0, "robot.delay_s": 0.04}
+    (said,) = propose_table(found, robot, sets)
+    assert sets == {"robot.delay_s": 0.04, "robot.speed_at_hz": found.pairs}
+    assert said == "speeds: 80 ± 1 um/s at 5 Hz, 165 ± 2 um/s at 10 Hz; the stated table is up to -20 % off"
+    assert propose_table(found._replace(std_um_s=(30.0, 30.0)), robot, dict(sets, **{"robot.um_per_rev": 16.0})) == [
+        "speeds: 80 ± 30 um/s at 5 Hz, 165 ± 30 um/s at 10 Hz; the stated table agrees"
+    ]

@@ -157,7 +157,7 @@ class Sampler:
             np.array([seconds(estimate.stamp_ns) - filter_memory_s]),
             robot.radius_um,
         )
-        return one if previous is None else previous.only(slice(-self.capacity + 1, None)).followed_by(one)
+        return one if previous is None else previous.followed_by(one).only(slice(-self.capacity, None))
 
 
 def _central(values: Floats, discarded: float) -> Bools:

@@ -92,3 +92,22 @@ def test_a_counter_that_is_set_back_is_followed_from_its_third_frame_on_at_the_l
 def test_a_stamp_is_the_nearest_to_its_time(time_s):
     assert abs(nanoseconds(time_s) - time_s * 1e9) <= 0.51
     assert seconds(nanoseconds(time_s)) == pytest.approx(time_s, rel=0.0, abs=0.6e-9)
+
+
+def test_a_camera_whose_counter_stood_still_for_a_while_is_dated_by_its_arrivals_again_after_four_intervals():
+    frame_ns = 33_333_333
+    device = 10**12 + frame_ns * np.arange(900)
+    fits = stamps_of(DeviceClock(), device, device + np.where(np.arange(900) < 300, 0, 500_000_000))
+    flags = [index for index, fit in enumerate(fits) if fit.flag]
+    assert [fits[index].flag for index in flags] == ["jump"] and 300 < flags[0] < 600
+    assert fits[flags[0] - 1].late_ns == 500_000_000 and fits[-1].late_ns == 0
+    assert fits[-1].stamp_ns == device[-1] + 500_000_000
+
+
+def test_a_unit_that_is_measured_while_the_host_catches_up_is_not_taken():
+    counts = 3_333_333 * np.arange(300)  # of 10 ns, where 1 ns is stated
+    busy_ns = 30 * counts[:14]
+    arrivals = np.concatenate([busy_ns, busy_ns[-1] + 10 * (counts[14:] - counts[13])])
+    fits = stamps_of(DeviceClock(), counts, arrivals)
+    assert [fit.flag for fit in fits if fit.flag] == ["unit"]
+    assert fits[-1].unit == pytest.approx(10.0, rel=0.01)

@@ -335,3 +335,8 @@ def test_the_point_of_an_opening_lies_so_many_um_along_the_channel_in_its_middle
     for name, end_px, sign in (("inlet", 0.0, 1.0), ("outlet", 199.0, -1.0)):
         x_um, y_um = opening_point_um(chip, name, 300.0)
         assert (x_um, y_um) == pytest.approx((end_px * um_per_px + sign * 300.0, 7.0 * um_per_px))
+
+
+def test_a_depth_of_nothing_takes_a_depth_away():
+    assert load_chip(ChipSettings(depth_um=60.0)).depth_um == 60.0
+    assert load_chip(ChipSettings(depth_um=0.0)).depth_um is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flowrec.core import FlowField
-from flowrec.physics import on_chip, sample, sample_as_seen
+from flowrec.physics import MapRaster, on_chip, raster_velocity, sample, sample_as_seen
 
 
 @pytest.fixture
@@ -42,3 +42,11 @@ def test_a_flow_as_the_image_shows_it_moves_a_point_of_the_image_as_the_flow_mov
     assert moved / 1e-3 == pytest.approx(sample(bilinear, on_chip(registration, seen)), rel=1e-6)
     assert np.array_equal(sample_as_seen(bilinear, seen), sample(bilinear, seen)), "without a registration"
     assert sample_as_seen(field, seen[0]) == pytest.approx(sample_as_seen(field, seen)[0])
+
+
+def test_the_kernel_of_the_control_loop_gives_the_flow_as_the_image_shows_it(bilinear):
+    field = replace(bilinear, registration=np.array([[0.97, 0.11, 3.0], [-0.06, 1.05, -2.0]]))
+    points = field.um_per_px * np.array([[2.3, 1.7], [1.1, 2.6], [3.2, 2.2]])
+    found = [raster_velocity(*MapRaster.of(field), *point) for point in points.tolist()]
+    np.testing.assert_allclose(found, sample_as_seen(field, points), rtol=1e-12)
+    assert np.abs(found).max() > 0.0

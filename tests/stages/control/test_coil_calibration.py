@@ -7,7 +7,7 @@ import pytest
 
 from flowrec.core import OutputError, UsageError
 from flowrec.measure import windings_matrix
-from flowrec.measure.calibrate_coils import calibrate_coils, settings_of
+from flowrec.measure.calibrate_coils import _with_doubt, calibrate_coils, settings_of
 from flowrec.measure.coil_calibration import Excitations, advice, fit_coils, read_excitations
 from flowrec.measure.coil_windings import winding_of
 from flowrec.measure.proposal import as_sets, check_outputs, write_outputs
@@ -295,6 +295,7 @@ def test_windings_make_the_configuration_of_a_run_a_column_for_each(tmp_path):
         (["x:coil:50:-10:3"], "radius and turns are above 0"),
         (["x:coil:inf:10:3"], "radius and turns are above 0"),
         (["x:coil:50:10:3"], "1 given; a rotating field needs three coils or more"),
+        (["x:coil:50:10:3", "y:coil:50:10:3"], "2 given; a rotating field needs three coils or more"),
         (["x:coil:50:10:3", "x:coil:50:10:3", "z:coil:50:10:3"], "no currents make a field along y"),
     ],
 )
@@ -323,3 +324,11 @@ def test_where_one_of_the_files_of_a_calibration_can_not_be_made_none_is_there(t
         "out.toml": b"settings",
         "out.png": b"picture",
     }
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said"),
+    [(2.0, 0.0, "2"), (2.1234, 0.02, "2.12 ± 0.02"), (-0.5, 3.0, "-0 ± 3"), (1.5, 1e-12, "1.5")],
+)
+def test_a_value_is_shown_to_the_first_digit_of_its_error_and_an_exact_one_as_it_is(value, std, said):
+    assert _with_doubt(value, std) == said

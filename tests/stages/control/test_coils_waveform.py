@@ -78,6 +78,19 @@ def test_neither_currents_nor_voltages_ever_leave_their_limits(situation):
         assert np.abs(played.voltages_v).max() <= INDUCTIVE.max_voltage_v + 1e-9
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.5 * math.pi])
+def test_a_short_ramp_of_inductive_coils_leaves_so_much_less_voltage_for_the_field(heading):
+    coils = replace(COILS, ramp_s=0.02)
+    full = field_limits(coils).operating_amplitude_mt(FOLLOWED_HZ)
+    limit = FOLLOWED_HZ * full / coils.amplitude_mt
+    order = FieldCommand(limit, heading, full, limit, coils.ramp_mt_s)
+    count = round(0.2 * full / coils.ramp_mt_s * RATE)
+    phases = np.linspace(0.0, 2.0 * math.pi, 24)
+    volts = [coils.output_samples(FieldState(phase, heading, 0.8 * full), order, count)[1] for phase in phases]
+    largest = np.abs(volts).max()
+    assert 0.5 * INDUCTIVE.max_voltage_v < largest <= INDUCTIVE.max_voltage_v
+
+
 @settings(max_examples=100)
 @given(situations())
 def test_a_robot_is_carried_exactly_where_the_field_travels(situation):

@@ -282,6 +282,17 @@ def test_the_time_of_every_hold_is_taken_off_the_limits_and_not_that_of_the_last
     assert outcomes.index("timeout") == 11  # of 2 x 4 s and 5 s two had passed
 
 
+def test_a_robot_that_is_not_found_may_be_looked_for_as_long_as_the_holds_last_besides() -> None:
+    world = World(find_limit_s=5.0)
+    for hold_s in (20, 6):
+        world.tick(seen=False, operator="pause")
+        for _ in range(hold_s - 1):
+            assert not world.tick(seen=False).finished
+        assert not world.tick(seen=False, operator="resume").finished
+    outcomes = [world.tick(seen=False).outcome for _ in range(8)]
+    assert outcomes.index("not found") == 4  # two of the five seconds had passed
+
+
 HERE = {"at": (200.0, 500.0), "progress": 1.0}
 
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from flowrec.core import Tick
+from flowrec.stages.control.events import event_of
 from tests.stages.control.test_mission import GOAL, World, field, navigating, observed, route, stretch, surveying
 
 
@@ -154,3 +156,20 @@ def test_routine_orders_do_not_count_as_routes_that_the_robot_was_blown_off() ->
     assert world.tick(error_um=400.0).wanted == "route", "the fifth order but for two of routine"
     world.tick(route=route(7))
     assert world.tick(error_um=400.0).outcome == "gave up"
+
+
+def test_a_hold_is_told_at_its_end_with_how_long_it_lasted() -> None:
+    world = navigating()
+    ticks = []
+    for operator in ("pause", "", "", "resume"):
+        mission = world.tick(operator=operator)
+        ticks.append(Tick(mission.stamp_ns if operator else ticks[-1].stamp_ns + 10**9, mission=mission))
+    told = event_of(ticks[-2], ticks[-1])
+    assert told is not None and told.text == "goes on after 3.0 s"
+
+
+def test_a_refined_flow_is_said_to_predict_better_only_by_more_than_twice_the_error_of_that() -> None:
+    scored = replace(field(3), log_score=-1.0, log_score_before=-1.1, log_score_error=0.04)
+    for refined, how in ((scored, "better"), (replace(scored, log_score_error=0.06), "no worse")):
+        told = event_of(Tick(0), Tick(1, refined=refined))
+        assert told is not None and f"predicts held-back observations {how} than the map before" in told.text

@@ -65,6 +65,23 @@ def test_in_uniform_flow_the_policy_swims_as_zermelo_says(flow):
         assert chosen @ best / np.hypot(*best) > np.cos(np.radians(3.0))
 
 
+@pytest.mark.parametrize(("flow_um_s", "frame_um"), [(0.0, 120.0), (300.0, 180.0)])
+def test_the_goal_is_held_from_where_a_frame_would_take_the_robot_past_it(flow_um_s, frame_um):
+    flow = np.array([flow_um_s, 0.0])
+    route = homeward_route(zermelo_s(pixels_um(), flow).astype(np.float32), time_to_go_um_per_px=PX_UM)
+    law, drift = Policy(kp_per_s=3.0, hold_radii=0.5), CorrectedFlow(None, flow)
+
+    def heading(left_um):
+        there = GOAL_UM - np.array([left_um, 0.0])
+        now = Situation(
+            None, mission(), route, seen_at(there), None, drift, SWIMMER, there, V, dt_s=0.2, um_per_px=PX_UM
+        )
+        return law.reference(now).heading
+
+    assert heading(frame_um - 5.0) is None
+    assert heading(frame_um + 5.0) is not None
+
+
 @pytest.mark.parametrize("flow", [(0.0, 0.0), (300.0, 0.0), (380.0, -380.0)])
 @pytest.mark.parametrize("left_um", [45.0, 60.0, 100.0, 200.0])
 def test_up_to_where_it_holds_the_robot_it_swims_as_zermelo_says_also_from_within_a_radius_of_the_goal(flow, left_um):

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flowrec.core import UsageError
 from flowrec.measure import MotionFit
-from flowrec.measure.calibrate_motion import heading_settings
+from flowrec.measure.calibrate_motion import _camera_delay, _means, _propose_settings, heading_settings
 from flowrec.measure.motion_fit import _stretches, fit_motion
 from flowrec.measure.motion_regression import Place, TrackRegression
 from flowrec.measure.motion_search import SearchRange, search
@@ -318,3 +320,30 @@ def test_the_proposed_axes_of_the_headings_are_the_stated_ones_and_then_those_th
             -1.0 if mirrored else 1.0
         )
         assert math.cos(math.radians(offset_deg + sense * log_deg - true_deg)) == pytest.approx(1.0, abs=1e-6)
+
+
+def made_up(**values: float) -> MotionFit:
+    """A fit of which a test reads some values."""
+    given = dict.fromkeys(MotionFit._fields, 0.0) | {"mirrored": False, "refusal": "", "um_per_rev": K}
+    return MotionFit(**given | values)  # type: ignore[arg-type]
+
+
+def test_a_delay_that_is_found_is_added_to_the_stated_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    late = made_up(offset_s=-0.012, offset_std_s=0.001)
+    monkeypatch.setitem(_camera_delay.__globals__, "_applied_turns", lambda *_: (None, (0.0, 1.0)))
+    monkeypatch.setitem(_camera_delay.__globals__, "fit_motion", lambda *_, **__: late)
+    robot, lab = SimpleNamespace(um_per_rev=K, delay_s=0.04), SimpleNamespace(camera_delay_s=0.03)
+    movie = SimpleNamespace(clock_offset_s=1.5, heading_offset_deg=0.0, heading_mirrored=False)
+    session: Any = SimpleNamespace(config=SimpleNamespace(robot=robot, lab=lab, movie=movie))
+    assert _camera_delay(session, np.zeros(2), np.zeros((2, 2)), None) == pytest.approx((0.042, 0.001))
+    sets, advice = _propose_settings(late, session, shared_clock=False, own_log=True)
+    assert sets["movie.clock_offset_s"] == 1.488 and "the log is not aligned" in " ".join(advice)
+
+
+def test_means_over_images_leave_out_those_of_which_one_lacks() -> None:
+    stamps = np.delete(np.arange(13) * 40_000_000, 5)
+    places = np.column_stack([np.arange(12.0), np.zeros(12)])
+    means_ns, means_um, around_ns = _means(stamps, places, 4)
+    assert means_ns.tolist() == [60_000_000, 420_000_000]
+    assert means_um[:, 0].tolist() == [1.5, 9.5]
+    np.testing.assert_allclose(around_ns, 40_000_000 * np.array([-1.5, -0.5, 0.5, 1.5]))

@@ -425,3 +425,14 @@ def test_the_error_of_an_observation_grows_with_the_own_motion_alone_and_an_unli
         found = sampler.collect(None, before, now, ROBOT)
         assert found is not None and found.std_um_s.tolist() == pytest.approx([math.hypot(3.0, 0.05 * own)])
         assert sampler.collect(None, before, replace(now, nis=25.1), ROBOT) is None
+
+
+@pytest.mark.parametrize("capacity", [1, 3])
+def test_of_more_observations_than_are_kept_the_latest_stay(capacity: int) -> None:
+    sampler, rows, before = Sampler(capacity=capacity), None, None
+    for index in range(6):
+        place = np.array([100.0 * index, 0.0])
+        now = Estimate(index * 10**9, place, np.array([1.0, 0.0]), np.eye(4), 2.0, place, True)
+        rows, before = sampler.collect(rows, before, now, ROBOT), now
+    assert rows is not None and np.diff(rows.position_um[:, 0]).tolist() == [100.0] * (capacity - 1)
+    assert rows.time_s is not None and 4.0 < rows.time_s[-1] <= 5.0

@@ -48,6 +48,18 @@ def test_an_interval_in_which_the_robot_was_driven_is_no_rest() -> None:
     assert np.isnan(parked_noise(tracks, turns)[0]) and parked_noise(tracks, turns)[1] == 0.0
 
 
+def test_places_of_a_robot_that_was_not_seen_add_nothing_to_the_noise_of_a_moving_one() -> None:
+    rng = np.random.default_rng(6)
+    stamps, seen = [round(each * 1e9 / 30.0) for each in range(400)], np.arange(400) % 6 != 0
+    places = 2.0 * rng.standard_normal((400, 2)) + np.where(seen, 0.0, 90.0)[:, None]
+    tracks = [
+        Track(at, bool(each), where, 0.9, 0, 5.0, np.zeros(4))
+        for at, each, where in zip(stamps, seen, places, strict=True)
+    ]
+    rest = [Applied(at, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2)) for at in stamps]
+    assert moving_noise(tracks, rest, ROBOT) == pytest.approx(2.0, rel=0.2)
+
+
 def test_a_position_of_something_else_counts_as_one_at_the_gate_and_not_by_its_distance() -> None:
     run = driven(6.0)
     tracks = [replace(each, position_um=each.position_um + 500.0 * (n % 20 == 0)) for n, each in enumerate(run.tracks)]

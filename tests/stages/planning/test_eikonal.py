@@ -244,3 +244,25 @@ def test_a_wide_margin_asked_for_by_hand_names_the_narrowest_place():
     )
     assert isinstance(field_of(mask, 0.0), FlowField)
     assert not route.reachable and "too narrow at 6" in route.reason
+
+
+def test_a_place_at_the_edge_of_the_chip_takes_as_long_as_one_half_a_pixel_nearer_to_a_wall():
+    free, deep = np.ones((6, 7), bool), np.full((6, 7), 9.0)
+    speed, need = 2.0, 2.0
+    at_edge = extend_to_walls(np.zeros((6, 7)), free, deep, need, speed)
+    assert at_edge[1:-1, 1:-1].max() == 0.0
+    in_band = free.copy()
+    in_band[:, 3] = False
+    nearer = extend_to_walls(np.zeros((6, 7)), in_band, np.where(in_band, deep, need - 0.5), need, speed)[2, 3]
+    assert nearer > 0.0
+    for edge in (at_edge[0, 1:-1], at_edge[-1, 1:-1], at_edge[1:-1, 0], at_edge[1:-1, -1]):
+        np.testing.assert_allclose(edge, nearer)
+
+
+@pytest.mark.parametrize("idle", [-1.0, 0.5])
+def test_what_a_way_costs_does_not_depend_on_how_many_points_a_pixel_has(idle):
+    rasters, target = water((0.3, -0.2), size=31, idle=idle), np.array([15.0, 15.0])
+    costs, fine = time_field(rasters, target), time_field(rasters.finer(2), 2.0 * target)[::2, ::2]
+    away = np.hypot(*(np.mgrid[0:31, 0:31] - 15.0)) > 5.0
+    unit = 4.0 if idle > 0.0 else 1.0  # an energy counts square pixels
+    np.testing.assert_allclose(fine[away], unit * costs[away], rtol=0.05)

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from flowrec.physics import Opening
 from flowrec.stages import Planner, open_space
-from flowrec.stages.planning.free_space import FastFlowMargin
+from flowrec.stages.planning.feasibility import swept_out
+from flowrec.stages.planning.free_space import CourseError, FastFlowMargin
 from flowrec.stages.planning.problem import attach_goal, attach_start
 from tests.stages.planning.worlds import PX, channel, chip_of, downstream, field_of, poiseuille, robot
 
@@ -31,6 +33,27 @@ def test_a_route_keeps_as_far_from_walls_as_the_robot_may_drift():
     assert lowest_um(Planner(swift=FAST).plan(field, *ends, chip, robot())) >= need_um
 
 
+def test_a_little_speed_is_left_where_the_flow_may_be_wrong_by_more_than_all_of_it():
+    mask = channel()
+    space = open_space(chip_of(mask), field_of(mask, 60.0), 10.0, 1.0)
+    assert np.unique(space.cost_rasters(10.0, 4.0).speed).tolist() == [6.0]
+    assert np.unique(space.cost_rasters(10.0, 25.0).speed).tolist() == pytest.approx([0.2])
+
+
+@pytest.mark.parametrize(("flow_um_s", "swept_um"), [(100.0, 45.0), (400.0, 280.0)])
+def test_a_robot_that_starts_where_the_flow_takes_it_out_before_the_coils_are_up_is_told_how_far(flow_um_s, swept_um):
+    mask = np.ones((30, 100), bool)
+    field, chip = field_of(mask, flow_um_s), chip_of(mask, [Opening("right", 0, 29, "outlet", 0.0)])
+    error = CourseError(blind_s=0.2, speed_um_s=200.0, radius_um=20.0)
+    edge_um = chip.size_um[0] - 0.5 * PX
+
+    def told(left_um):
+        return swept_out(chip, field, np.array([edge_um - left_um, 220.0]), error, 1.0)
+
+    assert f"carries the robot {swept_um:.0f} um before" in told(swept_um + 15.0)
+    assert told(swept_um + 25.0) == ""
+
+
 @pytest.mark.parametrize("method", ["time_field", "astar_time", "astar_length"])
 def test_where_the_drift_fills_the_channel_the_place_and_the_reason_are_named(method):
     mask = channel()
@@ -43,6 +66,9 @@ def test_where_the_drift_fills_the_channel_the_place_and_the_reason_are_named(me
     assert not route.reachable and "too swift to be steered at" in route.reason
     x_um = float(route.reason.split("at ")[1].split(",")[0])
     assert 500.0 < x_um < 600.0
+    # 0.2 x 2500 x 0.1 um for the map, 0.1 x 600 x 0.1 for the heading, (0.05 x 3100)^2 / 160 for the bend.
+    assert "in a flow of 2500 um/s and with 600 um/s of its own the robot may be 206 um off" in route.reason
+    assert "the walls leave 105 um" in route.reason  # 115 from the middle pixel to the wall, less the radius
     assert Planner(method=method).plan(field, *ends, chip, robot(600.0)).reachable, (
         "times that nobody set count for nothing"
     )

@@ -131,10 +131,13 @@ def test_a_robot_that_was_found_to_roll_less_per_revolution_is_planned_with_as_t
     mask = channel()
     chip, field, ends = chip_of(mask), field_of(mask, 20.0), ((1100.0, 195.0), (100.0, 195.0))
 
-    def duration_s(change, std, speed_um_s=100.0):
+    def duration_s(change, std, speed_um_s=100.0, swimmer=None):
         found = replace(field, parameter_names="depth_um; um_per_rev_share", parameters=[90.0, change])
-        return Planner().plan(replace(found, parameter_std=[9.0, std]), *ends, chip, robot(speed_um_s)).arrival_s[-1]
+        found = replace(found, parameter_std=[9.0, std])
+        return Planner().plan(found, *ends, chip, swimmer or robot(speed_um_s)).arrival_s[-1]
 
     usual = duration_s(0.0, 0.01)
     assert duration_s(-0.2, 0.02) == pytest.approx(duration_s(0.0, 0.01, 80.0))
     assert duration_s(-0.2, 0.15) == duration_s(0.2, 0.02) == usual
+    steps_out = replace(robot(), step_out_hz=80.0 / robot().um_per_rev)  # no plan needs more than was stated
+    assert duration_s(0.2, 0.02, swimmer=steps_out) == duration_s(0.0, 0.01, swimmer=steps_out) > usual

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flowrec.stages import travel_time
+from flowrec.stages.planning.route import too_fast
 from tests.stages.planning.worlds import channel, field_of, open_water, poiseuille
 
 
@@ -46,3 +47,10 @@ def test_to_stay_where_one_is_takes_no_time_also_where_the_flow_is_faster_than_t
     assert feasible and arrival.tolist() == [0.0, 0.0]
     path = np.array([[100.0, 300.0], [100.0, 300.0], [200.0, 300.0], [200.0, 300.0]])
     assert travel_time(field, path, 100.0)[0] == pytest.approx([0.0, 0.0, 1.0, 1.0])
+
+
+def test_the_place_where_the_flow_is_too_fast_is_named_by_x_and_then_y():
+    field = field_of(open_water(), lambda x, y: -50.0 - 100.0 * ((x > 295.0) & (x < 325.0)))
+    said = too_fast(field, np.array([[100.0, 200.0], [500.0, 200.0]]), 80.0)
+    x_um, y_um = map(float, said.split(" at ")[1].split(" um")[0].split(","))
+    assert 290.0 < x_um < 330.0 and y_um == 200.0 and said.startswith("the flow is too fast: 150 um/s")

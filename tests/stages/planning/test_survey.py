@@ -3,7 +3,7 @@ import pytest
 
 from flowrec.core import bilinear
 from flowrec.physics import ChipSettings, FlowSolver, clearance_um, load_chip, opening_point_um, sample
-from tests.stages.planning.worlds import PX, channel, chip_of, downstream, field_of, length_um, loop, robot
+from tests.stages.planning.worlds import PX, channel, chip_of, downstream, field_of, length_um, loop, poiseuille, robot
 
 
 def test_the_survey_goes_with_the_main_stream_and_stops_before_the_outlet():
@@ -38,6 +38,12 @@ def test_in_a_solved_flow_the_survey_runs_downstream_all_the_way_clear_of_walls(
     clearance = clearance_um(chip.mask, chip.um_per_px).astype(float)
     assert min(bilinear(clearance, *(p / chip.um_per_px)) for p in route.waypoints_um) >= swimmer.radius_um
     assert length_um(route) > 1.5 * chip.mask.shape[1] * chip.um_per_px / 2
+
+
+def test_a_survey_from_within_a_channel_goes_with_the_flow_though_more_of_it_lies_upstream():
+    mask = channel()
+    route = downstream(poiseuille(mask, 60.0), (900.0, 195.0), chip_of(mask), robot(200.0), distance_um=1e5)
+    assert route.reachable and (route.waypoints_um[1:, 0] > 900.0).all()
 
 
 def test_a_start_at_the_very_end_and_still_fluid_have_nothing_downstream():

@@ -11,10 +11,15 @@ from flowrec.physics.chip.chip import Chip, Opening
 from flowrec.physics.flow.linear_solver import clear_cache
 from flowrec.physics.flow.sampling import sample
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.refine import Assimilate, Refiner, assimilate, causes
+from flowrec.physics.flow.uncertainty import Doubts
+from flowrec.stages.refine import Assimilate, Refiner, assimilate, causes, uncertainty
+from flowrec.stages.refine.assimilate import Hypotheses
 from flowrec.stages.refine.discretisation_error import ModelError
-from flowrec.stages.refine.field_variance import field_columns
+from flowrec.stages.refine.field_variance import field_columns, prior_left_variance, prior_of
+from flowrec.stages.refine.findings import findings
+from flowrec.stages.refine.flow_model import flow_model
 from flowrec.stages.refine.hypothesis import of_the_field
+from flowrec.stages.refine.method import RefinementProblem
 from flowrec.stages.refine.observation_operator import observation_operator
 
 
@@ -116,6 +121,21 @@ def test_error_bars_beside_walls_cover_a_wall_that_is_a_pixel_off_where_no_robot
     # A pixel is three and a half times what is usual.
     assert with_walls > 0.7
     assert with_walls > without + 0.1
+
+
+def test_walls_that_are_off_leave_as_much_doubt_within_the_width_of_a_channel_as_along_it():
+    mask = np.zeros((14, 48), bool)
+    mask[3:11] = True
+    openings = (Opening("left", 3, 10, "inlet", 100.0), Opening("right", 3, 10, "outlet", 0.0))
+    model = flow_model(
+        Assimilate(), ModelError(), Chip("straight", mask, 10.0, openings, 1.0, 1e3, walls="pixel"), FlowSolver()
+    )
+    columns, covariance = prior_of(model)
+    every_column = np.diag(covariance)[:, None, None] * columns**2
+    along, within = np.zeros((2, *mask.shape))
+    along[mask] = every_column[-len(model.resistance) :].sum(axis=0)[:, 0]
+    within[mask] = prior_left_variance(model)[:, 0] - model.error_std**2
+    assert (within[6:8] > along[6:8]).all()  # in the middle, where moving the profile sideways changes nothing
 
 
 def test_the_note_names_the_openings_that_no_observation_reached(twin):
@@ -239,19 +259,20 @@ def test_few_or_odd_observations_never_make_the_field_worse(twin, which):
     assert which != "huge std" or "nothing about inlet 0" in refined.note
 
 
-def test_the_note_says_that_only_two_inlets_together_are_seen():
+@pytest.mark.parametrize("width", [8, 32])  # of the lower inlet, with as much inflow
+def test_the_note_says_that_only_two_inlets_together_are_seen(width):
     mask = np.zeros((30, 60), bool)
     mask[11:19, 20:] = True
-    mask[:, 20:28] = True
+    mask[:19, 20:28] = mask[11:, 20 : 20 + width] = True
     openings = (
         Opening("top", 20, 27, "inlet", 100.0),
-        Opening("bottom", 20, 27, "inlet", 100.0),
+        Opening("bottom", 20, 19 + width, "inlet", 800.0 / width),
         Opening("right", 11, 18, "outlet", 0.0),
     )
     chip = Chip("tee", mask, 10.0, openings, 1.0, 1000.0, walls="pixel")
     solver = FlowSolver()
-    assumed, true = solver.solve(chip), solver.solve(chip.with_boundary([130.0, 110.0, 0.0]))
-    points = np.column_stack([np.arange(400.0, 550.0, 20.0), np.full(8, 145.0)])
+    assumed, true = solver.solve(chip), solver.solve(chip.with_boundary([130.0, 880.0 / width, 0.0]))
+    points = np.column_stack([np.linspace(540.0, 590.0, 8), np.full(8, 145.0)])
     observed = Observations(0, points, sample(true, points), np.full(8, 2.0))
     note = Refiner().refine(assumed, observed, chip, solver).note
     assert "of inlet 0 (top) and inlet 1 (bottom) they see only the flow together" in note
@@ -312,10 +333,53 @@ def test_less_what_the_registration_does_the_observations_lie_on_the_flow(twin):
     moved = replace(case.observations, position_um=case.observations.position_um + np.array([0.0, 22.0]))
     operator = observation_operator(moved, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
     every = Assimilate().hypotheses(operator, case.chip, case.solver)
-    flow_um_s, _ = of_the_field(every.best)
+    best = every.best
+    flow_um_s, std_um_s = of_the_field(best)
     stated = operator.with_walls(every.best.observed.model.expansion.wall_px).on_fluid(case.chip.mask)
     off = flow_um_s - stated.predict(every.best.flow)
     assert np.sqrt((off**2).mean()) < 0.01 * np.sqrt((flow_um_s**2).mean())
+    noise = best.robust.factor**2 * best.robust.variance / best.robust.inlier
+    _, noisier = of_the_field(replace(best, robust=replace(best.robust, factor=2.0 * best.robust.factor)))
+    np.testing.assert_allclose(noisier**2 - std_um_s**2, 3.0 * noise, rtol=1e-6)
+
+
+def test_what_the_observations_can_not_tell_is_within_the_bars_of_the_map_and_of_what_was_found(twin, monkeypatch):
+    case = twin()
+    operator = observation_operator(case.observations, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
+    best = Assimilate().hypotheses(operator, case.chip, case.solver).best
+    first, mean = 0, best.posterior.mean.copy()
+    for effect in best.effects:
+        mean[first : first + len(effect.columns)] += 0.04 * (effect.name == "scale")
+        first += len(effect.columns)
+    other = replace(best, flow=best.flow + 10.0, posterior=replace(best.posterior, mean=mean))
+    problem = RefinementProblem(case.assumed, operator, case.chip, case.solver, assimilated=None)
+    monkeypatch.setattr(uncertainty, "doubted_places", lambda *_: Doubts.none(len(best.flow)))
+    fields, unsure = [], []
+    for weights in (np.array([1.0, 0.0]), np.array([0.5, 0.5])):
+        every = Hypotheses([best, other], weights, np.array([1.0, 0.0]), case.chip.mask)
+        monkeypatch.setattr(Assimilate, "hypotheses", lambda *_, every=every: every)
+        fields.append(Assimilate().fit(problem))
+        unsure.append(Refiner().uncertainty(case.assumed, case.observations, case.chip, case.solver).std_um_s)
+    sure, torn = (field.std_um_s[case.chip.mask].astype(float) for field in fields)
+    np.testing.assert_allclose(torn**2 - sure**2, 0.5 * 10.0**2, rtol=1e-3)
+    np.testing.assert_allclose(unsure[1] ** 2 - unsure[0] ** 2, 0.5 * 10.0**2, rtol=1e-3)
+    (value, std), (other_value, wider) = (
+        findings([best, other], weights).of("um_per_px_share")
+        for weights in (np.array([1.0, 0.0]), np.array([0.5, 0.5]))
+    )
+    assert other_value - value == pytest.approx(0.02)
+    assert wider**2 - std**2 == pytest.approx(0.02**2)
+
+
+def test_the_pressures_of_a_refined_map_are_those_of_its_inflow_and_its_fluid(twin):
+    case = twin(noise=0.01, assumed=(100.0, 0.004, -0.004), truth=(100.0, 0.006, -0.006))  # as of a thinner fluid
+    settings = Assimilate(doubt_walls=False, doubt_depth=False, inlet_std_share=0.02, outlet_std_share=0.01)
+    solver = FlowSolver(convection=False)
+    refined = Refiner(assimilate=settings).refine(case.assumed, case.observations, case.chip, solver)
+    chip = case.chip.with_boundary(refined.boundary_values, refined.viscosity_mpa_s)
+    solved = solver.solve(chip).pressure_pa
+    assert abs(refined.viscosity_mpa_s / case.chip.viscosity_mpa_s - 1.0) > 0.1
+    np.testing.assert_allclose(refined.pressure_pa, solved, atol=0.01 * np.ptp(solved))
 
 
 @pytest.mark.slow("refines a flow with strong inertia")

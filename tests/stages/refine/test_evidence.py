@@ -1,10 +1,13 @@
 """Evidence against draws of its own model, and against generalised least squares where the sizes are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from flowrec.stages.refine.evidence import Effect, EffectModel, _points
+from flowrec.stages.refine.noise import MOST_OBSERVATIONS, OUTLIER_NATS, Robust, outlying
 
 
 def drawn(seed, count=40, unknowns=6, size=0.3, noise=0.1, ln_std=1.0, median=0.3):
@@ -110,3 +113,23 @@ def test_the_sizes_are_known_as_well_as_the_expected_information_says():
     # Half of the trace of C^-1 dC C^-1 dC', of a normal distribution with zero mean, and the hyperprior's precision.
     information = [[0.5 * np.trace(inverse @ one @ inverse @ other) for other in slopes] for one in slopes]
     np.testing.assert_allclose(sizes.covariance, np.linalg.inv(information + np.diag([0.5**-2, 0.8**-2])), rtol=1e-9)
+
+
+def test_an_unknown_that_nothing_observes_keeps_the_mean_square_of_the_sizes_of_its_effect():
+    rng = np.random.default_rng(8)
+    seen, other = rng.standard_normal((2, 1, 20))
+    columns = np.concatenate([seen, np.zeros((1, 20))])
+    y = 0.5 * seen[0] + 0.3 * rng.standard_normal(20)
+    evidence = EffectModel(y, 0.09 * np.eye(20), [Effect("one", 0.3, 1.5, columns), Effect("other", 0.2, 1.0, other)])
+    found = evidence.posterior(evidence.sizes())
+    assert found.covariance[1, 1] == pytest.approx(found.square_sizes[0], rel=0.01)
+    assert found.square_sizes[0] > 1.2 * found.sizes[0] ** 2
+
+
+def test_what_outliers_cost_a_hypothesis_is_subtracted_once():
+    robust = Robust(np.ones(MOST_OBSERVATIONS), np.full(MOST_OBSERVATIONS, 0.5), 1.0)
+    nats = MOST_OBSERVATIONS * (0.5 * OUTLIER_NATS + np.log(0.5))
+    assert outlying(robust) == pytest.approx(nats)
+    # Of observations that are averaged with others the evidence does not hold the loss.
+    more = replace(robust, inlier=np.append(robust.inlier, 1.0))
+    assert outlying(more) == pytest.approx(nats - MOST_OBSERVATIONS * np.log(0.5))

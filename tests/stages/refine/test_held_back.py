@@ -11,7 +11,7 @@ from flowrec.core.messages import Observations
 from flowrec.physics.flow.sampling import sample
 from flowrec.stages.refine import Ni, Refiner
 from flowrec.stages.refine.held_back import BLOCKS, FEWEST, block_scores, blocks, worse
-from flowrec.stages.refine.refiner import NO_FLOW
+from flowrec.stages.refine.refiner import NO_FLOW, keep_flow
 
 
 def refined_of(case, before=None, observations=None, **settings):
@@ -94,6 +94,17 @@ def test_a_map_in_use_is_tested_on_what_was_made_after_it_alone(twin):
             assert refined_of(case, doubled, timed).log_score_before < found.log_score_before - 1.0
         said = f"not tested on observations that were held back: {new} are too few"
         assert (said in found.note) is not tested
+
+
+def test_where_the_map_in_use_is_the_assumed_one_after_a_refusal_all_observations_test_the_next(twin):
+    case = twin()
+    timed = replace(case.observations, time_s=np.arange(len(case.observations.std_um_s)) * 0.5)
+    after_all = replace(case.assumed, stamp_ns=10**12)
+    refused = keep_flow(after_all, "by gain it predicts observations that were held back worse")
+    found = refined_of(case, refused, timed, method="gain")
+    first = refined_of(case, None, timed, method="gain")
+    assert found.log_score_before == first.log_score_before is not None
+    assert refined_of(case, after_all, timed, method="gain").log_score_before is None
 
 
 def test_the_factor_that_predicts_a_block_is_that_of_the_others(twin):

@@ -61,20 +61,45 @@ def test_the_gradient_of_the_loss_holds_that_of_the_viscosity():
     )
 
 
+def residual_size(flow, operator, chip):
+    """Root mean square residual of a flow in the momentum equations of a chip, over its largest pressure gradient."""
+    case = Case.of(flow, operator, chip, cropped=False)
+    fluid, inside, v, p = (
+        torch.from_numpy(np.array(a, np.float64))[None, None]
+        for a in (case.fluid, case.inside, np.moveaxis(case.velocity, -1, 0), case.pressure)
+    )
+    residuals = Physics.of(fluid, inside, case.reynolds, case.friction, case.viscosity).residuals(v[0], p)
+    largest = np.abs(np.gradient(case.pressure)).max()
+    return float(residuals[0, 1:].square().mean().sqrt()) / largest
+
+
 def test_the_flow_of_the_solver_satisfies_the_equations_of_its_law_only(flows):
     chip, _, truth, operator = flows
+    assert residual_size(truth, operator, chip) < 0.5 * residual_size(truth, operator, replace(chip, law=None))
 
-    def size(of):
-        case = Case.of(truth, operator, of, cropped=False)
-        fluid, inside, v, p = (
-            torch.from_numpy(np.array(a, np.float64))[None, None]
-            for a in (case.fluid, case.inside, np.moveaxis(case.velocity, -1, 0), case.pressure)
-        )
-        residuals = Physics.of(fluid, inside, case.reynolds, case.friction, case.viscosity).residuals(v[0], p)
-        largest = np.abs(np.gradient(case.pressure)).max()
-        return float(residuals[0, 1:].square().mean().sqrt()) / largest
 
-    assert size(chip) < 0.5 * size(replace(chip, law=None))
+@pytest.mark.parametrize("law", [None, PowerLaw(0.5)])
+def test_the_flow_of_the_solver_satisfies_the_equations_of_its_depth_only(flows, law):
+    chip, _, _, operator = flows
+    shallow = replace(chip, depth_um=40.0, law=law)
+    flow = FlowSolver().solve(shallow)
+    own, deeper, flatter = (
+        residual_size(flow, operator, replace(shallow, depth_um=depth)) for depth in (40.0, 70.0, 25.0)
+    )
+    assert own < 0.6 * min(deeper, flatter)
+
+
+def test_a_thinning_fluid_between_two_plates_has_the_pressure_gradient_of_its_law(flows):
+    chip = replace(flows[0], depth_um=20.0, um_per_px=10.0)
+    speed, depth, px, n = 200.0, 20.0, 10.0, 0.5
+    local = LocalViscosity.of(chip, speed, px)
+    at_plate = 2.0 * (2.0 + 1.0 / n) * speed / depth  # 1/s
+    gradient = 2.0 * at_plate**n / depth * px**2 / (speed * local.scale)
+    fluid = torch.ones(1, 1, 9, 9, dtype=torch.float64)
+    flow = torch.cat([fluid, 0.0 * fluid], 1)
+    pressure = -gradient * torch.arange(9.0, dtype=torch.float64).expand(1, 1, 9, 9)
+    residuals = Physics.of(fluid, fluid, 0.0, 12.0 * (px / depth) ** 2, local).residuals(flow, pressure)
+    assert residuals[0, 1, 3:6, 3:6].abs().max() < 0.01 * gradient
 
 
 @pytest.mark.slow("balances a flow of two laws")

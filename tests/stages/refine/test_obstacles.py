@@ -9,7 +9,12 @@ from flowrec.physics.chip.openings import find_openings, guess_inlets
 from flowrec.physics.chip.synthetic import bifurcation
 from flowrec.physics.flow.sampling import relative_rmse, sample
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.refine import PiUnet, Refiner
+from flowrec.stages.refine import Assimilate, PiUnet, Refiner, doubts
+from flowrec.stages.refine.causes import Observed
+from flowrec.stages.refine.discretisation_error import ModelError
+from flowrec.stages.refine.flow_model import flow_model
+from flowrec.stages.refine.noise import robust_noise
+from flowrec.stages.refine.observation_operator import observation_operator
 from flowrec.stages.refine.obstacles import Obstacle
 
 SOLVER = FlowSolver()
@@ -120,3 +125,13 @@ def test_an_obstacle_closes_the_side_of_the_flow_that_it_names(chip):
     assert left[:, 75].sum() < 0.8 * left[:, 80].sum(), "a deposit is round"
     assert whole.sum() > 2.0 * left.sum()
     assert not whole[~chip.mask].any()
+
+
+def test_where_observations_say_nothing_a_channel_is_partly_blocked_as_likely_as_before(twin, monkeypatch):
+    case = twin()
+    model = flow_model(Assimilate(), ModelError(), case.chip, case.solver)
+    operator = observation_operator(case.observations, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
+    observed = Observed.of(model, operator)
+    monkeypatch.setattr(doubts, "deposits_um_s", lambda *_: np.zeros((12, len(model.base), 2), np.float32))
+    found = doubts.doubted_places(observed, robust_noise(observed), case.solver, 0.4)
+    assert len(found.probability) == 12 and found.probability.sum() == pytest.approx(0.4)

@@ -11,7 +11,7 @@ import pytest
 from flowrec.core.messages import FlowField, Observations
 from flowrec.stages.refine import Refiner
 from flowrec.stages.refine.findings import TAKEN_FOR, map_doubts
-from flowrec.stages.refine.predictive_check import UNEXPLAINED
+from flowrec.stages.refine.predictive_check import UNEXPLAINED, Departure
 
 REFINER = Refiner(adopt="always")
 PLACE_UM = np.array([300.0, 120.0])
@@ -108,3 +108,11 @@ def test_what_an_unsteady_pump_explains_is_said_of_the_pump(twin):
     field = refine(case, seen)
     assert "the pump pulsates" in field.note
     assert UNEXPLAINED not in field.note and "shakes" not in field.note
+
+
+def test_a_departure_at_a_place_widens_the_bars_there_by_what_it_found_and_one_of_the_heading_none():
+    flow = np.array([[0.0, 100.0], [100.0, 0.0], [0.0, 20.0]])
+    points = np.array([[10.0, 20.0], [90.0, 20.0], [90.0, 40.0]])
+    found = Departure(20.0, -np.inf, 0.3, 0.1, 5.0, points[0], 3.0, None, None)
+    np.testing.assert_allclose(found.least_variance(points, flow)[:, 0], [30.0**2, 5.0**2, 2.0**2])
+    assert not replace(found, heading_rad=1.0).least_variance(points, flow).any()

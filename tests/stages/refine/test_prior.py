@@ -1,15 +1,19 @@
 """The prior against the solver: the flow of a chip whose fluid and boundary values are those of a draw."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from flowrec.core.messages import Observations
 from flowrec.physics.chip.chip import Chip, Opening
-from flowrec.physics.chip.fluid import PowerLaw
+from flowrec.physics.chip.fluid import CarreauYasuda, PowerLaw
 from flowrec.physics.flow.solver import FlowSolver
-from flowrec.stages.refine import Refiner
+from flowrec.stages.refine import Assimilate, Refiner
+from flowrec.stages.refine.discretisation_error import ModelError
+from flowrec.stages.refine.flow_model import flow_model
+from flowrec.stages.refine.hypothesis import HypothesisFit
 from flowrec.stages.refine.prior import Prior, PriorSettings
 
 SETTINGS = PriorSettings()
@@ -105,3 +109,39 @@ def test_the_law_of_viscosity_is_found_where_the_flow_tells_it_and_left_open_whe
     # In a shallow channel every fluid has the same plug.
     value, std = exponent(20.0, 4)
     assert std > 0.1
+
+
+def test_a_closed_inlet_is_as_uncertain_as_the_fastest_open_one(driven):
+    inlets = tuple(
+        replace(one, kind="inlet", value=value) for one, value in zip(driven.openings[:2], (100.0, 0.0), strict=True)
+    )
+    prior = Prior.of(SETTINGS, replace(driven, openings=(*inlets, driven.openings[2])), 0.01)
+    assert prior.effect[0, 0] == prior.effect[1, 1] == SETTINGS.inlet_std_share * 100.0
+
+
+def test_a_chip_without_a_depth_has_no_unknown_of_its_depth(driven):
+    solver = FlowSolver(convection=False)
+    modes = solver.sensitivities(driven, friction=True).modes
+    assert len(modes) == len(Prior.of(replace(SETTINGS, depth_std_share=0.1), driven, 0.01).effect[0])
+
+
+def test_the_doubt_about_the_error_of_the_grid_is_an_unknown_of_the_size_that_is_set(driven):
+    solver = FlowSolver(k=2, convection=False)
+    once, twice = (flow_model(Assimilate(), ModelError(share_std=std), driven, solver).known[-1] for std in (0.1, 0.2))
+    assert np.abs(once).max() > 0.0
+    np.testing.assert_array_equal(twice, 2.0 * once)
+
+
+def test_a_parameter_that_enters_a_law_by_its_logarithm_has_the_error_of_its_logarithm_times_itself(driven):
+    law = CarreauYasuda(0.5, 3.0, 0.5)
+    names, count = law.unknowns, len(law.unknowns)
+    prior = SimpleNamespace(law_stds=(0.2,) * count, law_index=0)
+    model = SimpleNamespace(prior=prior, chip=replace(driven, law=law))
+    unknowns = np.full(count, 1.5), 0.04 * np.eye(count)
+    fit = SimpleNamespace(observed=SimpleNamespace(model=model), unknowns=lambda *_: unknowns)
+    for name, (value, std) in zip(names, HypothesisFit.law.fget(fit).values(), strict=True):
+        stated = float(getattr(law, name.removeprefix("ln ")))
+        by_log = name.startswith("ln ")
+        assert value == pytest.approx(stated * np.exp(0.3) if by_log else stated + 0.3)
+        assert std == pytest.approx(0.04 * (value if by_log else 1.0))
+    assert any(name.startswith("ln ") for name in names)

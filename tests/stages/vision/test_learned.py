@@ -323,6 +323,21 @@ def test_far_from_where_it_is_expected_the_robot_must_be_the_only_one_of_its_loo
     assert Tracker()._is_robot(found, 0, expected, 20.0) is is_robot
 
 
+def test_a_robot_of_any_look_that_was_out_of_sight_is_looked_for_as_far_as_it_may_have_gone_meanwhile() -> None:
+    rng, (y, x) = np.random.default_rng(4), np.mgrid[0:200, 0:300]
+    tracker = Tracker(polarity="bright", click_px=(60.0, 100.0))
+    robot = Robot(radius_um=5.0, max_speed_um_s=125.0, step_out_hz=1e4)  # 15 px in an image at three times its speed
+    chip, track, look = Chip("open", np.ones(x.shape, bool), 1.0, (), 1.0, 1000.0), None, None
+    for index, at in enumerate((60.0, None, None, None, None, 150.0)):
+        light = 0.0 if at is None else 120.0 * np.exp(-((x - at) ** 2 + (y - 100.0) ** 2) / 18.0)
+        image = np.clip(40.0 + 2.0 * rng.standard_normal(x.shape) + light, 0.0, 255.0).astype(np.uint8)
+        track, look = tracker.follow(
+            track, look, Frame(index * 40_000_000, index, image), chip, Calibration(1.0), robot
+        )
+        assert track.seen is (at is not None)
+    assert track is not None and track.position_um.tolist() == pytest.approx([150.0, 100.0], abs=0.5)
+
+
 def bodies(*rows: tuple[float, float, float, float]) -> Candidates:
     """Candidates by x, y, energy and similarity."""
     x, y, energy, similarity = np.array(rows, float).reshape(-1, 4).T

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -123,6 +125,22 @@ def found_at(tracker: Tracker, tracks: list, look, places, expected_px, std_px: 
     expected = [Expected(np.array(place) * UM, std_px * UM) for place in expected_px]
     image = frame(np.array(places, float), index, **drawn)
     return tracker.follow_all(tracks, expected, look, image, CHIP, CALIBRATION, ROBOT, (0.0, 0.0), np.zeros(2))[0]
+
+
+def test_the_robot_of_the_mission_is_looked_for_everywhere_in_each_image_and_others_in_every_tenth() -> None:
+    tracker, places = Tracker(robots=2, polarity="auto"), np.array([[60.0, 60.0], [120.0, 60.0]])
+    tracks, look = tracker.follow_all(
+        [], [], None, frame(places, 0), CHIP, CALIBRATION, ROBOT, (0.0, 0.0), places[0] * UM
+    )
+    moved = places + np.array([0.0, 30.0])
+    for lost, index, seen in ((0, 101, True), (1, 101, False), (1, 110, True)):
+        before = [replace(track, stamp_ns=round((index - 1) * FRAME_S * 1e9)) for track in tracks]
+        before[lost] = replace(before[lost], seen=False, lost_frames=60, seen_ns=0)
+        at, expected = places.copy(), places.copy()
+        at[lost] = moved[lost]
+        found = found_at(tracker, before, look, at, expected, 0.5, index)
+        assert [each.seen for each in found] == [True if n != lost else seen for n in (0, 1)]
+        assert not seen or np.hypot(*(found[lost].position_um / UM - moved[lost])) < 0.5
 
 
 def test_of_robots_that_may_be_anywhere_nearby_their_looks_tell_which_is_which() -> None:

@@ -97,6 +97,25 @@ def test_the_box_of_the_fluid_moves_with_the_image_along_each_axis_by_its_own_sh
     assert walls.for_shift((40.0, 20.0)).box == (60, 30, 300, 100)  # as far as the image goes
 
 
+def test_the_distance_to_the_walls_moves_with_the_image_along_each_axis_by_its_own_shift() -> None:
+    row, column = np.mgrid[:40, :60].astype(np.float32)
+    walls = Walls(column + np.float32(100.0) * row, (0, 0, 60, 40))
+    moved = walls.for_shift((5.0, -3.0)).distance_px
+    np.testing.assert_allclose(moved[10:30, 10:50], walls.distance_px[13:33, 5:45], atol=1e-3)
+
+
+def test_a_shift_beyond_what_the_stage_can_make_is_not_believed() -> None:
+    on = chip()
+    still, near, far = (image(on, [], shift, seed=n) for n, shift in enumerate([(0.0, 0.0), (3.0, 0.0), (6.0, 0.0)]))
+    for reach_px, there in ((4.0, False), (8.0, True)):
+        stage = replace(ON, reach_px=reach_px)
+        shift = background = None
+        for number, picture in enumerate((still, near, far)):
+            shift, background = stage.register(shift, background, None, frame(number, picture), on, CALIBRATION, ROBOT)
+        assert shift is not None and shift.found is there
+        assert shift.shift_px[0] == pytest.approx(6.0 if there else 3.0, abs=0.2)
+
+
 def test_the_track_on_a_shaking_stage_is_that_of_the_chip() -> None:
     on, tracker = chip(), Tracker(polarity="auto", click_px=(40.0, 80.0))
     track = appearance = shift = background = None

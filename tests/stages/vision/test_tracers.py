@@ -112,6 +112,7 @@ def test_nothing_of_the_robot_is_a_tracer() -> None:
     ring = place + 8.0 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
     ways = np.stack([np.vstack([ring, [[30.0, 40.0]]])] * 3)
     assert followed(ways, seen)[-1].count == 1
+    assert followed(ways, replace(seen, radius_px=3.0))[-1].count == 1, "it is no smaller than it is stated"
     assert followed(ways, replace(seen, seen=False))[-1].count == 4
 
 

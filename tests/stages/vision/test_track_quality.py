@@ -96,6 +96,11 @@ def test_an_image_that_becomes_much_stronger_is_doubted() -> None:
     assert "5.8 times as strong as at the beginning" in doubt
 
 
+def test_an_image_that_becomes_much_weaker_is_doubted_with_what_is_left_of_it() -> None:
+    (doubt,) = doubts([replace(t, energy=50.0 if n < 40 else 10.0) for n, t in enumerate(tracks())])
+    assert "is 20 % as strong as at the beginning" in doubt
+
+
 def test_a_round_body_that_turns_into_a_ring_is_doubted_and_one_that_stays_is_not() -> None:
     axis = np.arange(-8, 9)
     distance = np.hypot(axis[None], axis[:, None])

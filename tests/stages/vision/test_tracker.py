@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ CHIP = load_chip(ChipSettings())
 WALLS = clearance_um(CHIP.mask, CHIP.um_per_px)
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0)
 TRACKER = Tracker()
+NO_DEBRIS = Particles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 class Scene:
@@ -91,6 +94,18 @@ def test_a_robot_out_of_sight_keeps_its_place_and_is_found_again_nearby_and_far_
     again = scene.track(track, scene.frame(far, 21))
     assert again.seen
     np.testing.assert_allclose(again.position_um, far, atol=5.0)
+
+
+def test_a_disc_that_is_followed_though_its_size_is_off_is_not_taken_for_a_robot_that_was_out_of_sight() -> None:
+    scene, tracker = Scene(640), Tracker(acquire_score=0.85)
+    place = np.array([500.0, 2780.0])
+    followed = scene.track(None, scene.frame(place, debris=0))
+    larger = scene.microscope.image([DrawnRobot(place, 1.2 * ROBOT.radius_um)], NO_DEBRIS)
+    lost = replace(followed, seen=False, lost_frames=1)
+    seen = [
+        tracker.track(each, Frame(33_000_000, 1, larger), CHIP, scene.calibration, ROBOT) for each in (followed, lost)
+    ]
+    assert [each.seen for each in seen] == [True, False] and 0.55 < seen[0].score < 0.85
 
 
 def test_once_locked_only_a_region_is_searched() -> None:
