@@ -86,6 +86,8 @@ def judge(key: str, hint: Any, default: Any) -> None:
     if key.endswith((".rates_1_s", ".ratios", ".nominals")):
         default = (1.0,)
     whole = isinstance(valid.low, int)
+    told = [float(format(limit, "g")) for limit in (valid.low, valid.high) if not whole]
+    assert all(limit in valid for limit in told), f"{key}: a limit as it is told would be refused: {valid}"
     below = valid.low - 1 if whole else math.nextafter(valid.low, -math.inf)
     above = valid.high + 1 if whole else math.nextafter(valid.high, math.inf)
     outside = {below: valid.low, -math.inf: valid.low, above: valid.high, math.inf: valid.high, math.nan: None}

@@ -98,7 +98,7 @@ class FastFlowMargin:
     # ratio of the map's error to the flow's speed; None: from the map
     map_error: Annotated[float, Range(0.0, 10.0)] | None = None
     # three standard deviations of the rolling direction
-    heading_error_rad: Annotated[float, Range(0.0, 0.5 * math.pi)] = 0.1
+    heading_error_rad: Annotated[float, Range(0.0, 1.5708)] = 0.1
     frame_s: Annotated[float, Range(0.0, 10.0)] | None = None  # time between two images; None: the camera's
     latency_s: Annotated[float, Range(0.0, 10.0)] | None = None  # time from command to motion; None: the robot's
 
