@@ -24,10 +24,21 @@ from flowrec.physics import (
 )
 from flowrec.rigs import SimulatedRig, true_depth_um, true_robot
 from flowrec.rigs.simulated.bodies import Swimmer
+from flowrec.rigs.simulated.microscope import NO_PARTICLES, DrawnRobot, Microscope, Particles
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.true_walls import at_centres, cut_up, true_walls
 from flowrec.rigs.simulated.world import Shake, misregister, true_chip, true_pump
-from flowrec.stages import Simulated, assemble, config_from_toml, derived_values, load_config, to_toml, with_sets
+from flowrec.stages import (
+    CameraSettings,
+    Simulated,
+    SimulatedImage,
+    assemble,
+    config_from_toml,
+    derived_values,
+    load_config,
+    to_toml,
+    with_sets,
+)
 from flowrec.stages.resolve import resolve
 from flowrec.stages.simulated_settings import WORLDS
 from tests.short_missions import SMALL
@@ -268,6 +279,37 @@ def test_a_shaken_stage_moves_the_image_of_everything_and_the_robot_of_the_truth
         found_px, _ = cv2.phaseCorrelate(*images, cv2.createHanningWindow((320, 256), cv2.CV_32F))
         expected_px = Shake.of(Simulated(world="kind", seed=1, shake_um=60.0)).at(a.stamp_ns * 1e-9) / 20.0
         assert found_px == pytest.approx(expected_px, abs=0.25)
+
+
+def test_a_body_is_drawn_where_the_stage_has_moved_it_and_as_long_as_its_way_in_the_exposure():
+    camera = CameraSettings(width_px=100, height_px=80, exposure_s=0.1)
+    image = SimulatedImage(debris=0, read_noise=0.0, photons_per_level=1e6)
+    mask = np.ones((80, 100), bool)
+    mask[0] = mask[-1] = False
+    scope = Microscope(mask, 10.0, Calibration(10.0, (0.0, 0.0)), camera, image, seed=1)
+    at_um, columns, rows = np.array([500.0, 400.0]), np.arange(100.0), np.arange(80.0)
+
+    def moments(values, weights):
+        mean = np.average(values, weights=weights)
+        return mean, np.average((values - mean) ** 2, weights=weights)
+
+    def darkened(robots, particles=NO_PARTICLES, stage_um=(0.0, 0.0)):
+        """Mean and variance along x and along y of what bodies darken, in px."""
+        off_um = np.array(stage_um)
+        dark = np.float64(scope.image([], stage_um=off_um)) - scope.image(robots, particles, off_um)  # rims: below 0
+        dark[:22] = dark[55:] = dark[:, :32] = dark[:, 74:] = 0.0  # far from the body there is noise alone
+        return moments(columns, dark.sum(0)), moments(rows, dark.sum(1))
+
+    robot = DrawnRobot(at_um, 40.0)
+    bead = Particles(at_um[None], np.array([40.0]), np.array([0.8]))
+    for bodies in (([robot],), ([], bead)):
+        for stage_um, place_px in (((0.0, 0.0), (50.0, 40.0)), ((60.0, -30.0), (56.0, 37.0))):
+            (x, _), (y, _) = darkened(*bodies, stage_um=stage_um)
+            assert (x, y) == pytest.approx(place_px, abs=0.05)
+    still, moving = darkened([robot]), darkened([robot._replace(velocity_um_s=np.array([600.0, 0.0]))])
+    # The variance of a way of 6 px that is exposed evenly is 6^2 / 12.
+    assert moving[0][1] - still[0][1] == pytest.approx(3.0, abs=0.5)
+    assert moving[1][1] == pytest.approx(still[1][1], abs=0.5)
 
 
 def test_oblique_light_is_another_profile_whose_centre_the_tracker_still_finds():
