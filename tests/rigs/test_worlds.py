@@ -307,6 +307,7 @@ def test_a_body_is_drawn_where_the_stage_has_moved_it_and_as_long_as_its_way_in_
             (x, _), (y, _) = darkened(*bodies, stage_um=stage_um)
             assert (x, y) == pytest.approx(place_px, abs=0.05)
     still, moving = darkened([robot]), darkened([robot._replace(velocity_um_s=np.array([600.0, 0.0]))])
+    assert moving[0][0] == pytest.approx(50.0, abs=0.05)
     # The variance of a way of 6 px that is exposed evenly is 6^2 / 12.
     assert moving[0][1] - still[0][1] == pytest.approx(3.0, abs=0.5)
     assert moving[1][1] == pytest.approx(still[1][1], abs=0.5)
