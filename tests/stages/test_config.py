@@ -39,13 +39,17 @@ def test_a_configuration_survives_its_own_toml() -> None:
         ("robot.um_per_rev=100000", "robot.step_out_hz"),
         ("robot.max_speed_um_s=0.01", "robot.step_out_hz"),
         ("coils.amplifier.a_per_v=1e-06", "robot.max_speed_um_s"),
+        ("camera.width_px=8", "camera.um_per_px"),
     ],
 )
 def test_what_follows_from_settings_and_could_not_be_read_again_is_refused_by_its_name(given: str, key: str) -> None:
     config = load_config(None, [given])
+    chip = load_chip(config.chip)
+    if key.startswith("camera"):
+        chip = replace(chip, um_per_px=100.0)  # 32 mm on 8 pixels
     told = rf"^{re.escape(key)} = \S+: must be from .* follows from other settings [^\n]*$"
     with pytest.raises(UsageError, match=told):
-        resolve(config, load_chip(config.chip))
+        resolve(config, chip)
 
 
 def test_a_session_from_before_a_setting_has_the_value_with_which_it_replays_unchanged() -> None:
