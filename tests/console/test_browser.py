@@ -58,8 +58,10 @@ def recorded(out: Path, *sets: str) -> Iterator[subprocess.Popen[str]]:
     words = set_words(sets)
     command = [sys.executable, "-m", "flowrec", "record", "--realtime", "--console", "--out", str(out)]
     with subprocess.Popen([*command, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        yield process
-        process.kill()
+        try:
+            yield process
+        finally:  # Popen waits for it, also where the test has failed
+            process.kill()
 
 
 @pytest.fixture
