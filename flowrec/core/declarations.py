@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from flowrec.core.enums import WorkOrder
 from flowrec.core.errors import NotFiniteError
-from flowrec.core.units import NS_PER_S, seconds
+from flowrec.core.units import seconds
 
 Result = TypeVar("Result")
 
@@ -222,7 +222,7 @@ class Message:
 
     def since_s(self, earlier: Message | None) -> float:
         """Time in s from the stamp of an earlier record to that of this one; 0 where there is none."""
-        return 0.0 if earlier is None else (self.stamp_ns - earlier.stamp_ns) / NS_PER_S
+        return 0.0 if earlier is None else seconds(self.stamp_ns - earlier.stamp_ns)
 
     def same_as(self, other: object) -> bool:
         """True if the other record is the same bit for bit (NaN equals NaN)."""

@@ -162,14 +162,10 @@ class McapReader(Closing):
         except DAMAGE as error:
             raise self.damage_error(offset, str(error) or type(error).__name__) from error
 
-    def read_summary(self) -> Summary:
-        """The summary section, checksum verified; nothing in it lies outside the file or over something else."""
-        if self._summary is not None:
-            found, self._summary = self._summary, None  # once, because who asks changes it
-        else:
-            found = self._long_summary(*self._footer())
-        found.file_bytes = self.size
-        return found
+    def read_summary(self, known: Summary | None = None) -> Summary:
+        """The summary section, checksum verified, or a known one; nothing in it lies outside the file or overlaps."""
+        kept, self._summary = self._summary, None  # once, because who asks changes it
+        return known or kept or self._long_summary(*self._footer())
 
     def lookup_agrees(self) -> bool:
         """False if the lookup record repeats something else than what other programs read."""

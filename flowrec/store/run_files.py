@@ -188,12 +188,12 @@ class Run:
     def at(cls, path: Path) -> Self:
         """Run of the files that `path` names; SessionError as `files_of` and `check_continuity`."""
         found: list[RunFile] = []
-        indexes: list[Summary] = []
+        first_index: Summary | None = None
         for path_of_file in files_of(path):
             with SessionMetadata(path_of_file) as file:
                 found.append(RunFile.of(file))
-                indexes = indexes or [file.index]
-        run = cls(path, found, *indexes)
+                first_index = first_index or file.index
+        run = cls(path, found, first_index)
         if run.in_parts:
             check_continuity(path, found)
         return run

@@ -201,7 +201,7 @@ class SessionMetadata(Closing):
             )
         if summary is not None and summary.file_bytes not in (0, self.source.size):
             raise SessionError(f"{path}: has changed since it was opened; open the session again")
-        self.index = found = summary or self.source.read_summary()
+        self.index = found = self.source.read_summary(summary)
         self.channels, self.schemas, self.chunks = found.channels, found.schemas, found.chunks
         self.attachments, self.metadata = found.attachments, found.metadata
         records = self._records()
@@ -221,6 +221,7 @@ class SessionMetadata(Closing):
                     self.source.set_start(index.log_time)
             if summary is None:  # one that is given is on the session clock
                 found.to_session_clock(self.source.start_unix_ns)
+                found.file_bytes = self.source.size
         assert found.statistics is not None  # McapReader or scan.py has checked it
         self.statistics: Statistics = found.statistics
 
