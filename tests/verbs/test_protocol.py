@@ -154,20 +154,23 @@ def measured(row: str, **config: Any) -> RowValue:
 
 
 def test_a_row_has_the_error_of_what_was_stated_in_its_unit_and_the_limit_that_it_promises(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     fit = SimpleNamespace(offset_s=-0.08, offset_std_s=0.001, um_per_rev=33.0, um_per_rev_std=0.1)
     monkeypatch.setattr("flowrec.measure.calibrate_motion", lambda _path: SimpleNamespace(fit=fit))
     poses = [SimpleNamespace(calibration=SimpleNamespace(um_per_px=scale)) for scale in (2.0, 2.03, 1.99)]
     monkeypatch.setattr("flowrec.measure.calibrate_image", lambda *_: SimpleNamespace(poses=poses))
-    made = SimpleNamespace(mt_per_a=np.array([[2.0, 0.3], [0.1, 2.0], [0.0, 0.4]]))
-    monkeypatch.setattr("flowrec.measure.calibrate_coils", lambda _path: SimpleNamespace(fit=made))
+    currents_a = np.vstack((np.zeros(3), np.eye(3), -np.eye(3)))
+    read_mt = currents_a @ np.array([[2.0, 0.3, 0.0], [0.1, 2.0, 0.0], [0.0, 0.4, 2.0]]).T
+    monkeypatch.chdir(tmp_path)
+    header = "i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt"
+    np.savetxt("table.csv", np.hstack((currents_a, read_mt)), "%g", ",", header=header, comments="")
     monkeypatch.setattr(protocol_rows, "flow_error", lambda *_: 0.08)
     monkeypatch.setattr(
         protocol_rows, "refine", lambda *_, **__: SimpleNamespace(refused="", note="", error_share=None)
     )
     camera, robot = SimpleNamespace(um_per_px=2.0, rate_hz=20.0), SimpleNamespace(delay_s=0.05, um_per_rev=30.0)
-    coils = SimpleNamespace(mt_per_a=((2.0, 0.0), (0.1, 2.0), (0.0, 0.0)))
+    coils = SimpleNamespace(mt_per_a=((2.0, 0.0, 0.0), (0.1, 2.0, 0.0), (0.0, 0.0, 2.0)))
     found = {
         row: measured(row, camera=camera, robot=robot, coils=coils)
         for row in ("scale", "latency", "um_per_rev", "field", "flow")
